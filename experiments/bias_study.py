@@ -1,0 +1,268 @@
+"""One view under one light, prepared for trying biases: nothing is rasterized again.
+
+The two passes, the places of all pixels in the map and, for biases that act on depth
+alone, the texels that they ask are computed once. A trial is then a comparison per pixel.
+Pixels turned away from the light are dark whatever the bias, so they are left out.
+"""
+
+import abc
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from shadows.bias import Bias, CombinedBias
+from shadows.compare import Compare, HardCompare
+from shadows.filters import Filter, Tap, compare_taps, look_up
+from shadows.render import Rendering, Shading, receive_surface
+from shadows.shadow_map import Receiver, ShadowMap
+from tangentspace._math import dot
+
+from .metrics import ShadowErrors, contact_gap, shadow_errors
+from .render_scene import render_scene, shade_scene
+from .scene import Scene
+from .truth import Occluders, nearest_occluder_distance, trace_visibility
+
+
+class Goal(eqx.Module):
+    """What visibility is compared with, at the pixels that face the light.
+
+    Attributes:
+        unit: What ``error`` counts.
+    """
+
+    unit: ClassVar[str]
+
+    @abc.abstractmethod
+    def residual(self, visibility: Float[Array, " pixels"]) -> Float[Array, "..."]:
+        """Return what a least-squares fit makes small."""
+
+    @abc.abstractmethod
+    def error(self, visibility: Float[Array, " pixels"]) -> Float[Array, ""]:
+        """Return what counts in the end, under hard comparison."""
+
+
+class TruthGoal(Goal):
+    """Ray-traced visibility.
+
+    Attributes:
+        truth: 1 where lit.
+        surface_count: Pixels with a surface, of which ``error`` is a share.
+    """
+
+    unit: ClassVar[str] = "share of wrong pixels"
+    truth: Float[Array, " pixels"]
+    surface_count: Float[Array, ""]
+
+    def residual(self, visibility: Float[Array, " pixels"]) -> Float[Array, " pixels"]:
+        """Return visibility minus truth."""
+        return visibility - self.truth
+
+    def error(self, visibility: Float[Array, " pixels"]) -> Float[Array, ""]:
+        """Return the share of surface pixels on the wrong side of one half."""
+        wrong = jnp.where(self.truth > 0.5, visibility <= 0.5, visibility >= 0.5)
+        return jnp.sum(wrong) / self.surface_count
+
+
+class ImageGoal(Goal):
+    """A target image; the color is ``unlit + visibility * direct``.
+
+    Attributes:
+        unlit: Color in full shadow.
+        direct: What the light adds.
+        target: Linear RGB.
+        limit: Where the target's format saturates: 1 for PNG, infinity for EXR.
+    """
+
+    unit: ClassVar[str] = "rms of linear radiance at pixels that face the light"
+    unlit: Float[Array, "pixels 3"]
+    direct: Float[Array, "pixels 3"]
+    target: Float[Array, "pixels 3"]
+    limit: Float[Array, ""]
+
+    def residual(self, visibility: Float[Array, " pixels"]) -> Float[Array, "pixels 3"]:
+        """Return color minus target."""
+        color = self.unlit + visibility[:, None] * self.direct
+        return jnp.minimum(color, self.limit) - self.target
+
+    def error(self, visibility: Float[Array, " pixels"]) -> Float[Array, ""]:
+        """Return the root mean square of the residual."""
+        return jnp.sqrt(jnp.mean(self.residual(visibility) ** 2))
+
+
+class Trial(NamedTuple):
+    """What trying a bias needs, at the pixels that face the light.
+
+    Attributes:
+        receiver: The pixels in the map, without bias.
+        taps: What the filter reads there while the texel does not move.
+        shadow_map: For biases that move the texel.
+        goal: What visibility is compared with.
+    """
+
+    receiver: Receiver
+    taps: tuple[Tap, ...]
+    shadow_map: ShadowMap
+    goal: Goal
+
+    def visibility(self, bias: Bias, filter: Filter, compare: Compare) -> Float[Array, " pixels"]:
+        """Return the visibility of the facing pixels under a bias."""
+        receiver = bias(self.receiver)
+        if bias.moves_texel:
+            return look_up(self.shadow_map, receiver, filter=filter, compare=compare)
+        return compare_taps(self.taps, receiver, compare)
+
+    def error(self, bias: Bias, filter: Filter) -> Float[Array, ""]:
+        """Return the goal's error under hard comparison."""
+        return self.goal.error(self.visibility(bias, filter, HardCompare()))
+
+    @property
+    def footprint_length(self) -> Float[Array, ""]:
+        """Median texel footprint of the pixels as a world length along the light ray."""
+        slanted = jnp.median(self.receiver.footprint / jnp.abs(self.receiver.depth_rate))
+        return jnp.maximum(slanted, 0.05 * jnp.median(self.receiver.texel_length))
+
+
+class Study(NamedTuple):
+    """A view with its truth, on which biases are judged.
+
+    Attributes:
+        scene: What is seen.
+        unbiased: The view with zero bias, with both passes.
+        filter: Which texels are asked.
+        shading: How the pictures are lit.
+        truth: Ray-traced visibility.
+        occluder_distance: World length along the ray to what hides the light; inf if lit.
+        facing: Pixels whose face is turned to the light.
+        trial: What fits and sweeps work on.
+    """
+
+    scene: Scene
+    unbiased: Rendering
+    filter: Filter
+    shading: Shading
+    truth: Bool[np.ndarray, "height width"]
+    occluder_distance: Float[np.ndarray, "height width"]
+    facing: Bool[np.ndarray, "height width"]
+    trial: Trial
+
+    def visibility(self, bias: Bias) -> Float[np.ndarray, "height width"]:
+        """Return the image of hard visibility under a bias."""
+        image = np.zeros(self.facing.shape, np.float32)
+        image[self.facing] = hard_visibility(self.trial, bias, self.filter)
+        return image
+
+    def errors(self, bias: Bias) -> ShadowErrors:
+        """Judge a bias against the ray-traced truth."""
+        covered = np.asarray(self.unbiased.surface.covered)
+        return shadow_errors(self.visibility(bias), self.truth, covered)
+
+    def contact_gap(self, bias: Bias) -> float:
+        """Return the world length of shadow that a bias takes away at contacts."""
+        surface = self.unbiased.surface
+        to_light = self.scene.lights[0].to_light(surface.position)
+        sin_angle = np.sqrt(np.maximum(1 - np.asarray(dot(surface.face_normal, to_light)) ** 2, 0))
+        return contact_gap(
+            self.visibility(bias),
+            self.truth,
+            np.asarray(surface.covered),
+            self.occluder_distance,
+            sin_angle,
+        )
+
+    def picture(
+        self, visibility: Float[np.ndarray, "height width"]
+    ) -> Float[np.ndarray, "height width 3"]:
+        """Return the image, linear RGB, lit with a given visibility."""
+        light, surface = self.scene.lights[0], self.unbiased.surface
+        return np.asarray(shade_scene(self.scene, surface, light, visibility, self.shading))
+
+
+@eqx.filter_jit
+def hard_visibility(trial: Trial, bias: Bias, filter: Filter) -> Float[Array, " pixels"]:
+    """Return the hard visibility of the facing pixels."""
+    return trial.visibility(bias, filter, HardCompare())
+
+
+def prepare_study(
+    scene: Scene,
+    *,
+    image_size: tuple[int, int],
+    map_size: int,
+    filter: Filter,
+    shading: Shading,
+    cull_front: bool = False,
+) -> Study:
+    """Make both passes and trace the truth; the goal is that truth.
+
+    Args:
+        scene: What is seen; its first light counts.
+        image_size: Height and width in pixels.
+        map_size: Texels on each side of the shadow map.
+        filter: Which texels are asked.
+        shading: A function of ``tangentspace.lighting``, or one with its signature.
+        cull_front: Draw only faces turned away from the light into the map.
+
+    Raises:
+        ValueError: If nothing that is seen faces the light.
+    """
+    unbiased = render_scene(
+        scene,
+        image_size=image_size,
+        map_size=map_size,
+        bias=CombinedBias(),
+        filter=filter,
+        compare=HardCompare(),
+        shading=shading,
+        cull_front=cull_front,
+    )
+    light, surface, shadow_map = scene.lights[0], unbiased.surface, unbiased.shadow_map
+    receiver = jax.jit(receive_surface)(surface, light, shadow_map)
+    facing = np.asarray(surface.covered & (dot(receiver.normal, receiver.to_light) > 0))
+    if not facing.any():
+        raise ValueError(f"{scene.name}: no visible surface faces the light; move light or camera")
+    occluders = Occluders(scene.mesh.positions, scene.mesh.faces)
+    position, normal = np.asarray(surface.position), np.asarray(surface.face_normal)
+    face_ids = np.asarray(surface.face_ids)
+    truth = trace_visibility(position, normal, face_ids, light, occluders)
+    distance = nearest_occluder_distance(position, normal, face_ids, light, occluders)
+
+    at_pixels = Receiver._make(
+        [*(jnp.asarray(np.asarray(v)[facing]) for v in receiver[:-1]), receiver.texel_from_world]
+    )
+    goal = TruthGoal(
+        jnp.asarray(truth[facing], jnp.float32), jnp.sum(surface.covered).astype(jnp.float32)
+    )
+    trial = Trial(at_pixels, filter.taps(shadow_map, at_pixels), shadow_map, goal)
+    return Study(scene, unbiased, filter, shading, truth, distance, facing, trial)
+
+
+def with_target(
+    study: Study, target: Float[np.ndarray, "height width 3"], *, limit: float = np.inf
+) -> Study:
+    """Return the study with an image as its goal.
+
+    Args:
+        study: A view.
+        target: Linear RGB, of the view's size.
+        limit: Where the target's format saturates: 1 for PNG.
+
+    Raises:
+        ValueError: If the sizes differ.
+    """
+    if target.shape[:2] != study.facing.shape:
+        raise ValueError(
+            f"target image: expected height x width {study.facing.shape} as the view, "
+            f"got {target.shape[:2]}; set the image size or scale the target"
+        )
+    unlit, lit = (study.picture(np.full(study.facing.shape, v, np.float32)) for v in (0.0, 1.0))
+    goal = ImageGoal(
+        unlit=jnp.asarray(unlit[study.facing]),
+        direct=jnp.asarray((lit - unlit)[study.facing]),
+        target=jnp.asarray(target[study.facing]),
+        limit=jnp.asarray(limit, jnp.float32),
+    )
+    return study._replace(trial=study.trial._replace(goal=goal))

@@ -1,0 +1,77 @@
+"""What must hold before anything is computed; each failure is one line for the user."""
+
+import os
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from shadows.lights import DirectionalLight, Light, PointLight, SpotLight
+from shadows.transforms import transform_points
+
+from .scene import Scene
+
+_LARGEST_IMAGE = 8192
+
+
+def check_size(option: str, *sizes: int) -> None:
+    """Refuse image and map sizes that are not from 1 to 8192."""
+    if not all(1 <= size <= _LARGEST_IMAGE for size in sizes):
+        got = " ".join(map(str, sizes))
+        raise ValueError(f"{option}: expected sizes from 1 to {_LARGEST_IMAGE} pixels, got {got}")
+
+
+def check_folder(folder: Path) -> None:
+    """Make a folder, and refuse one that cannot be made or written to."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        reason = error.strerror or error
+        raise ValueError(f"{folder}: cannot be made ({reason}); choose another folder") from error
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise ValueError(f"{folder}: cannot be written to; choose another folder")
+
+
+def check_out(path: Path, *suffixes: str) -> None:
+    """Refuse an output file of another kind, or in a folder that is missing or read-only."""
+    if path.suffix.lower() not in suffixes:
+        raise ValueError(f"{path}: expected a name that ends in {' or '.join(suffixes)}")
+    if not path.parent.is_dir():
+        raise ValueError(f"{path}: no folder {path.parent}; make it or choose another place")
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise ValueError(f"{path}: its folder cannot be written to; choose another place")
+
+
+def check_scene(scene: Scene) -> None:
+    """Refuse cameras and lights that see nothing or have no sense."""
+    camera, light = scene.camera, scene.lights[0]
+    near, far = float(camera.near), float(camera.far)
+    if not near < far:
+        raise ValueError(
+            f"{scene.name}: the camera's near ({near:g}) must be less than its far ({far:g})"
+        )
+    _check_light(scene.name, light)
+    positions = np.asarray(scene.mesh.positions)
+    if isinstance(light, PointLight):
+        low, high = positions.min(axis=0), positions.max(axis=0)
+        if np.all((low < light.position) & (light.position < high)):
+            raise ValueError(
+                f"{scene.name}: the point light stands inside the scene, where one shadow map "
+                "cannot see all around; move it out or use a spot light"
+            )
+    matrix = light.clip_from_world(jnp.asarray(positions))
+    clip = np.asarray(transform_points(matrix, jnp.asarray(positions)))
+    if not np.isfinite(clip).all() or np.all(clip[:, 3] <= 0):
+        raise ValueError(f"{scene.name}: nothing is in the light's view; move or turn the light")
+
+
+def _check_light(name: str, light: Light) -> None:
+    if isinstance(light, DirectionalLight | SpotLight):
+        length = float(np.linalg.norm(np.asarray(light.direction)))
+        if not np.isfinite(length) or length < 1e-6:
+            raise ValueError(f"{name}: the light's direction is zero (light at its target?)")
+    if isinstance(light, SpotLight) and not 0 < float(light.outer_angle) < np.pi / 2:
+        raise ValueError(
+            f"{name}: expected the spot's outer angle between 0 and pi/2, "
+            f"got {float(light.outer_angle):g}"
+        )

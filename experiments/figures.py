@@ -1,0 +1,135 @@
+"""Pictures and charts of a bias fit; colors that survive color blindness and gray print."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import matplotlib.figure
+import matplotlib.patches
+import numpy as np
+from jaxtyping import Bool, Float
+
+from .images import atomic_path, linear_to_srgb
+
+ACNE_COLOR = "#e69f00"  # light orange: truth lit, method dark
+LEAK_COLOR = "#0072b2"  # dark blue: truth dark, method lit
+_BACKGROUND = 0.85  # linear gray behind the scene, in pictures only
+_ACNE = np.array([0.791, 0.347, 0.0])
+_LEAK = np.array([0.0, 0.168, 0.445])
+
+Image = Float[np.ndarray, "height width 3"]
+Mask = Bool[np.ndarray, "height width"]
+
+
+def on_background(color: Image, covered: Mask) -> Image:
+    """Put a light gray behind what is covered."""
+    return np.where(covered[..., None], color, np.float32(_BACKGROUND))
+
+
+def error_picture(
+    color: Image, visibility: Float[np.ndarray, "height width"], truth: Mask, covered: Mask
+) -> Image:
+    """Return the image in pale gray with acne in orange and leaks in blue, linear RGB."""
+    gray = 0.35 + 0.4 * np.clip(color.mean(axis=-1, keepdims=True), 0, 1)
+    picture = on_background(np.repeat(gray, 3, axis=-1), covered)
+    picture[covered & truth & (visibility <= 0.5)] = _ACNE
+    picture[covered & ~truth & (visibility >= 0.5)] = _LEAK
+    return picture.astype(np.float32)
+
+
+def save_comparison(path: Path, panels: Mapping[str, Image], *, title: str) -> None:
+    """Save pictures in rows of four, each under its title, with a legend of the errors."""
+    rows = -(-len(panels) // 4)
+    figure = matplotlib.figure.Figure(figsize=(16, 4.25 * rows + 0.7), layout="constrained")
+    for index, (name, picture) in enumerate(panels.items()):
+        axes = figure.add_subplot(rows, 4, index + 1)
+        axes.imshow(linear_to_srgb(np.clip(picture, 0, 1)), interpolation="nearest")
+        axes.set_title(name, fontsize=11)
+        axes.set_axis_off()
+    figure.suptitle(title, fontsize=13)
+    figure.legend(
+        handles=[
+            _swatch(ACNE_COLOR, "acne: lit in truth, dark here"),
+            _swatch(LEAK_COLOR, "leak: dark in truth, lit here"),
+        ],
+        loc="outside lower center",
+        ncols=2,
+        frameon=False,
+    )
+    _save(figure, path)
+
+
+def save_curve(
+    path: Path,
+    *,
+    scales: Float[np.ndarray, " points"],
+    acne: Float[np.ndarray, " points"],
+    leak: Float[np.ndarray, " points"],
+    marks: Mapping[str, tuple[float, float]],
+    title: str,
+) -> None:
+    """Save the acne-leak curve over a bias that grows, with marked biases on it.
+
+    Args:
+        path: PNG file.
+        scales: Multiples of the fitted bias.
+        acne: Share of truth-lit pixels that are dark, at each.
+        leak: Share of truth-dark pixels that are lit, at each.
+        marks: Acne and leak of the biases to mark.
+        title: What the chart shows.
+    """
+    figure = matplotlib.figure.Figure(figsize=(7, 5.2), layout="constrained")
+    axes = figure.add_subplot()
+    curve = np.stack([100 * acne, 100 * leak], axis=1)
+    axes.plot(*curve.T, color="0.45", lw=1.4, zorder=1, label="multiples of the fitted bias")
+    last = np.full(2, np.inf)
+    for scale in 2.0 ** np.arange(-3, 7):
+        place = curve[np.argmin(np.abs(scales - scale))]
+        if np.linalg.norm(np.log(place + 0.05) - np.log(last + 0.05)) < 0.3:
+            continue  # its label would lie on the last one
+        axes.plot(*place, marker=".", color="0.45", ms=6, zorder=1)
+        axes.annotate(
+            f"{scale:g}x",
+            place,
+            xytext=(7, 4),
+            textcoords="offset points",
+            color="0.35",
+            fontsize=9,
+        )
+        last = place
+    styles = (("o", ACNE_COLOR, 9), ("*", LEAK_COLOR, 17), ("D", "black", 11))
+    for (name, (x, y)), (marker, color, size) in zip(marks.items(), styles, strict=False):
+        hollow = marker == "D"
+        axes.plot(
+            100 * x,
+            100 * y,
+            ls="",
+            marker=marker,
+            ms=size,
+            zorder=3 if hollow else 2,
+            mfc="none" if hollow else color,
+            mec="black",
+            label=f"{name}: {x:.2%} acne, {y:.2%} leak",
+        )
+    axes.set_xscale("symlog", linthresh=0.05)
+    axes.set_yscale("symlog", linthresh=0.05)
+    ticks = [0, 0.05, 0.1, 0.5, 1, 5, 10, 50, 100]
+    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.minorticks_off()
+    axes.set_xlim(-0.01, 110)
+    axes.set_ylim(-0.01, 110)
+    axes.set_xlabel("acne: share of truth-lit pixels that are dark (%)")
+    axes.set_ylabel("leak: share of truth-dark pixels that are lit (%)")
+    axes.grid(color="0.9")
+    axes.legend(frameon=False, fontsize=9)
+    axes.set_title(title, fontsize=11)
+    _save(figure, path)
+
+
+def _swatch(color: str, label: str) -> matplotlib.patches.Patch:
+    return matplotlib.patches.Patch(color=color, label=label)
+
+
+def _save(figure: matplotlib.figure.Figure, path: Path) -> None:
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, dpi=110)

@@ -1,0 +1,131 @@
+"""Sweep a bias: every point of a grid from zero, so that a fit is judged against the best.
+
+The grid grows until its best point is not on its far border. Then its steps are halved until
+that changes the best error by less than 1 %: over the whole grid while that is affordable,
+after that over a window of eight steps round the best point.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from shadows.bias import CombinedBias
+from shadows.filters import Filter
+
+from .bias_space import BiasSpace, Clock, Search
+from .bias_study import Trial
+
+_BATCH = 256
+_FIRST_REACH = 8.0  # steps of the space: footprints or texels
+_LAST_REACH = 2.0**12
+_FIRST_COUNT = {1: 129, 2: 33, 3: 17}  # grid points along each number, by how many are free
+_LAST_COUNT = {1: 1025, 2: 65, 3: 17}  # of a grid over the whole range
+_WINDOW = 4  # steps to each side
+_HALVINGS = 12
+_CHANGE = 0.01
+
+
+class BiasSweep(NamedTuple):
+    """The best bias of a grid.
+
+    Attributes:
+        bias: The best.
+        values: Its numbers.
+        error: Under hard comparison.
+        points: Numbers of every bias on the last whole grid, in their own units.
+        errors: The error of each.
+        evaluations: Biases tried on all grids.
+        seconds: Run time, without compilation.
+        compile_seconds: Compilation.
+        converged: Whether the last halving changed the best error by less than 1 %.
+    """
+
+    bias: CombinedBias
+    values: dict[str, float]
+    error: float
+    points: Float[np.ndarray, "points numbers"]
+    errors: Float[np.ndarray, " points"]
+    evaluations: int
+    seconds: float
+    compile_seconds: float
+    converged: bool
+
+
+def sweep_bias(
+    trial: Trial,
+    bias: CombinedBias,
+    filter: Filter,
+    *,
+    free: Sequence[str] | None = None,
+    report: Callable[[str], None] = lambda text: None,
+) -> BiasSweep:
+    """Try a grid of biases under hard comparison.
+
+    Args:
+        trial: What is compared with what.
+        bias: Which terms there are; numbers that are not free keep their values.
+        filter: Which texels are asked.
+        free: Names of the numbers to sweep, at most three; None for all.
+        report: Told how far it is.
+
+    Raises:
+        ValueError: If a name is not one of the bias's numbers, or there are more than three.
+    """
+    space, clock = BiasSpace.of(bias, trial, free), Clock()
+    dimensions = len(space.names)
+    if dimensions not in _LAST_COUNT:
+        raise ValueError(f"sweep: expected at most 3 free numbers, got {dimensions}; fix some")
+    search = Search(space, trial, filter, clock, batch=_BATCH)
+    reach, count = np.full(dimensions, _FIRST_REACH), _FIRST_COUNT[dimensions]
+
+    def tried(low: np.ndarray, high: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+        points = _grid(low, high, count)
+        errors = search(points)
+        report(f"{search.evaluations} biases: best error {errors.min():.3%}")
+        return points, errors
+
+    while True:
+        points, errors = tried(np.zeros(dimensions), reach, count)
+        at_border = points[np.argmin(errors)] == reach
+        if not at_border.any() or reach.max() >= _LAST_REACH:
+            break
+        reach = np.where(at_border, 2 * reach, reach)
+    whole, step = (points, errors), reach / (count - 1)
+    best, best_error, converged = points[np.argmin(errors)], errors.min(), False
+    for _ in range(_HALVINGS):
+        step = step / 2
+        if 2 * count - 1 <= _LAST_COUNT[dimensions]:
+            count = 2 * count - 1
+            whole = points, errors = tried(np.zeros(dimensions), reach, count)
+        else:
+            low = np.maximum(best - 2 * _WINDOW * step, 0)
+            points, errors = tried(low, best + 2 * _WINDOW * step, 4 * _WINDOW + 1)
+        converged = bool(best_error - errors.min() <= _CHANGE * best_error)
+        if errors.min() < best_error:
+            best, best_error = points[np.argmin(errors)], errors.min()
+        if converged:
+            break
+    best = best.astype(np.float32)
+    return BiasSweep(
+        bias=space.bias(best),
+        values=space.values(best),
+        error=float(best_error),
+        points=whole[0] * np.asarray(space.step),
+        errors=whole[1],
+        evaluations=search.evaluations,
+        seconds=clock.seconds,
+        compile_seconds=clock.compile_seconds,
+        converged=converged,
+    )
+
+
+def _grid(
+    low: Float[np.ndarray, " numbers"], high: Float[np.ndarray, " numbers"], count: int
+) -> Float[np.ndarray, "points numbers"]:
+    """Return the points of a grid, the smallest first."""
+    ends = zip(low, high, strict=True)
+    axes = np.meshgrid(*(np.linspace(start, end, count) for start, end in ends), indexing="ij")
+    points = np.stack(axes, axis=-1).reshape(-1, len(low))
+    return points[np.argsort(np.sum(points / high, axis=1), kind="stable")]
