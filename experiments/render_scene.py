@@ -18,9 +18,9 @@ from tangentspace.lighting import blinn_phong, lambert, phong
 
 from .scene import Scene, face_colors
 
-# Ambient light so that shapes can be told in shadow; ``phong`` brings its own.
+
 SHADINGS: dict[str, Shading] = {
-    "blinn-phong": functools.partial(blinn_phong, ambient=0.1),
+    "blinn-phong": blinn_phong,
     "phong": phong,
     "lambert": functools.partial(lambert, albedo=0.8),
 }

@@ -8,6 +8,8 @@ A new filter is a new subclass of ``Filter``.
 """
 
 import abc
+import functools
+import operator
 from typing import NamedTuple
 
 import equinox as eqx
@@ -23,7 +25,7 @@ class Tap(NamedTuple):
 
     Attributes:
         stored: Depth of the texel; 1 outside the map.
-        weight: Its weight; the weights of a receiver's taps sum to 1.
+        weight: Its weight, relative to those of the receiver's other taps.
     """
 
     stored: Float[Array, "*points"]
@@ -86,7 +88,11 @@ def compare_taps(
     Returns:
         Visibility in [0, 1]; 1 where the receiver lies outside of what the map can tell.
     """
-    visibility = sum(tap.weight * compare(tap.stored, receiver) for tap in taps)
+    total = functools.reduce(operator.add, (tap.weight for tap in taps))
+    weighted = (tap.weight * compare(tap.stored, receiver) for tap in taps)
+    # The division is also where XLA stops fusing; without one it computes the comparison
+    # again for each color channel.
+    visibility = functools.reduce(operator.add, weighted) / total
     return jnp.where(receiver.outside, 1.0, visibility)
 
 

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from tangentspace._math import dot, safe_normalize
@@ -143,8 +142,6 @@ def shade(
         base_color: Factor on the color, linear RGB, per pixel; None for none.
         shading: A function of ``tangentspace.lighting``, or one with its signature.
     """
-    # Without a barrier the whole lookup would be computed again for each color channel.
-    visibility = lax.optimization_barrier(visibility)
     color = shading(
         surface.normal,
         light.to_light(surface.position),
