@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 INSTALL := $(PIP) install --constraint constraints.txt --build-constraint constraints.txt
 
-.PHONY: help fit render test style lint notebooks clean
+.PHONY: help fit render test style lint bench notebooks clean
 .DEFAULT_GOAL := help
 
 help: ## list the jobs
@@ -16,8 +16,10 @@ help: ## list the jobs
 fit: $(VENV)/run.stamp ## fit a shadow bias against ray-traced truth, into results/fit
 	$(BIN)/python -m experiments fit-bias --out results/fit
 
-render: $(VENV)/run.stamp ## render a scene with a shadow map, into results/render
-	$(BIN)/python -m experiments render --out results/render
+render: $(VENV)/run.stamp ## render a scene with its shadow map, into results/render
+	@mkdir -p results/render
+	$(BIN)/python -m experiments render --out results/render/image.exr \
+	  --png-out results/render/image.png --shadow-map-out results/render/shadow_map.exr
 
 test: $(VENV)/test.stamp ## run the tests
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
@@ -28,6 +30,10 @@ style: $(VENV)/dev.stamp ## check the form of the code
 
 lint: style ## check form and types (pyright fetches itself with npm)
 	$(BIN)/pyright
+
+bench: $(VENV)/run.stamp ## time the stages (leave the machine alone), into results/bench.json
+	@mkdir -p results
+	$(BIN)/python -m experiments.bench --out results/bench.json
 
 notebooks: $(VENV)/test.stamp ## execute the notebooks in place
 	$(BIN)/jupyter-execute --inplace notebooks/*.ipynb
