@@ -1,36 +1,108 @@
 """Command line: ``python -m experiments render`` and ``python -m experiments fit-bias``."""
 
+import contextlib
+import functools
+import io
 import os
 import sys
+from collections.abc import Callable, Sequence
 
-import equinox as eqx
-import tyro
+from rich.text import Text
 
 from .console import say_error
-from .fit_bias_command import fit
-from .render_command import render
 
-_COMMANDS = {"render": render, "fit-bias": fit}
+_PROGRAM = "python -m experiments"
 
 
 def main() -> int:
     """Run a command; errors are one line and exit code 2, an interrupt is 130."""
     try:
-        tyro.extras.subcommand_cli_from_dict(_COMMANDS, prog="python -m experiments")
-    except (ValueError, eqx.EquinoxRuntimeError) as error:
-        say_error(str(error).strip().splitlines()[0])
-        return 2
-    except MemoryError:
-        say_error("out of memory; choose a smaller image or shadow map")
-        return 2
+        return _run(sys.argv[1:])
     except KeyboardInterrupt:
         say_error("interrupted; files written so far are whole")
         return 130
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+
+
+def _run(arguments: Sequence[str]) -> int:
+    # Loaded here, so that an interrupt while they load, which takes seconds, ends well too.
+    import jax
+
+    from .fit_bias_command import fit
+    from .render_command import render
+
+    try:
+        _parse(arguments, {"render": render, "fit-bias": fit})()
+    except BrokenPipeError:
+        raise
+    except (ValueError, OSError) as error:
+        say_error(" ".join(str(error).split()))
+        return 2
+    except (MemoryError, jax.errors.JaxRuntimeError) as error:
+        if isinstance(error, jax.errors.JaxRuntimeError) and "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        say_error("out of memory; choose a smaller image or shadow map")
+        return 2
     return 0
 
 
+def _parse(
+    arguments: Sequence[str], commands: dict[str, Callable[..., None]]
+) -> Callable[[], None]:
+    """Return what the arguments ask for, ready to run.
+
+    Raises:
+        ValueError: If they are not understood.
+        SystemExit: After help was printed.
+    """
+    import tyro
+
+    from .options import hint
+
+    if arguments and not arguments[0].startswith("-") and arguments[0] not in commands:
+        raise ValueError(f"no such command '{arguments[0]}'; {hint(arguments[0], commands)}")
+    later = {name: _later(command) for name, command in commands.items()}
+    box = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(box):
+            return tyro.extras.subcommand_cli_from_dict(later, prog=_PROGRAM, args=arguments)
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+    raise ValueError(f"{_reason(box.getvalue())}; see {_PROGRAM} --help")
+
+
+def _later(command: Callable[..., None]) -> Callable[..., Callable[[], None]]:
+    """Return a function with the command's options that binds them and does not run it."""
+
+    @functools.wraps(command)
+    def bind(*args: object, **options: object) -> Callable[[], None]:
+        return functools.partial(command, *args, **options)
+
+    return bind
+
+
+def _reason(box: str) -> str:
+    """Return the first part of tyro's box as one line, and the option it thinks was meant."""
+    parts: list[list[str]] = [[]]
+    for line in Text.from_ansi(box).plain.splitlines()[1:]:
+        text = line.strip("│| ")
+        if set(text) <= set("─-╰╯+"):
+            parts.append([])
+        else:
+            parts[-1].append(text)
+    first, *others = filter(None, parts)
+    reason = " ".join(first).rstrip(".")
+    for part in others:
+        if part[0].startswith("Perhaps you meant"):
+            reason += f"; perhaps you meant {part[1]}"
+    return reason
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    code = main()
+    if code == 130:
+        os._exit(code)  # XLA may be compiling still, and crashes if it is torn down then
+    sys.exit(code)

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,11 +13,11 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from shadows.bias import CombinedBias
-from shadows.compare import SoftCompare
+from shadows.compare import HardCompare, SoftCompare
 from shadows.filters import Filter
 
 from .bias_study import Trial
-from .options import numbers
+from .options import hint, numbers
 
 _SAME = 0.01  # singular values below this share of the largest cannot be told apart
 
@@ -73,22 +73,16 @@ class BiasSpace(eqx.Module):
         """Choose the free numbers of a bias.
 
         Args:
-            bias: Any.
+            bias: At most one term of each kind.
             trial: Tells what a step means.
             names: The free numbers; None for all.
 
         Raises:
-            ValueError: If there is no such number, or none at all.
+            ValueError: As ``free_numbers``.
         """
+        chosen = free_numbers(bias, names)
         known = {n: unit for term in bias.terms for n, (_, unit) in numbers(term).items()}
-        unknown = sorted(set(names or ()) - set(known))
-        if unknown or not known:
-            raise ValueError(
-                f"fit: expected numbers of the bias to fit, from {', '.join(known) or 'none'}; "
-                f"got {', '.join(unknown) or 'a bias without terms'}"
-            )
-        free = tuple(names is None or name in names for name in known)
-        chosen = tuple(name for name, is_free in zip(known, free, strict=True) if is_free)
+        free = tuple(name in chosen for name in known)
         length = trial.footprint_length
         step = [
             length if known[name] == "world length" else jnp.ones_like(length) for name in chosen
@@ -115,6 +109,56 @@ class BiasSpace(eqx.Module):
         )
 
 
+def free_numbers(bias: CombinedBias, names: Sequence[str] | None = None) -> tuple[str, ...]:
+    """Return the names of the free numbers of a bias, in its order.
+
+    Args:
+        bias: At most one term of each kind.
+        names: The free numbers; None for all.
+
+    Raises:
+        ValueError: If a name is not one of the bias's numbers, if there is none to choose, or
+            if two terms are of the same kind.
+    """
+    known = [name for term in bias.terms for name in numbers(term)]
+    twice = sorted({name for name in known if known.count(name) > 1})
+    if not known or twice:
+        raise ValueError(
+            f"bias: expected one or more terms of different kinds, got {', '.join(twice)} twice"
+            if twice
+            else "bias: has no numbers to fit; name a bias, as constant or slope"
+        )
+    for name in () if names is None else names:
+        if name not in known:
+            raise ValueError(f"free {name}: no such number of the bias; {hint(name, known)}")
+    chosen = tuple(name for name in known if names is None or name in names)
+    if not chosen:
+        raise ValueError(f"free: names no number; choose from: {', '.join(known)}")
+    return chosen
+
+
+class Tried(NamedTuple):
+    """What came of many biases.
+
+    Attributes:
+        errors: Under hard comparison.
+        deviations: Mean size of the goal's residual, which decides between equal errors:
+            under 2x2 lookup a pixel can count as right and still be a shade too dark.
+    """
+
+    errors: Float[np.ndarray, " points"]
+    deviations: Float[np.ndarray, " points"]
+
+    @property
+    def best(self) -> int:
+        """Index of the least error, and of equal ones the least deviation."""
+        return int(np.lexsort((self.deviations, self.errors))[0])
+
+    def score(self, index: int) -> tuple[float, float]:
+        """Return what is compared, the smaller the better."""
+        return float(self.errors[index]), float(self.deviations[index])
+
+
 class Search:
     """Errors of many biases under hard comparison, a fixed number at a time.
 
@@ -132,25 +176,30 @@ class Search:
         self._errors = clock.compiled(_errors, *self._args, points)
         self.evaluations = 0
 
-    def __call__(self, points: Float[np.ndarray, "points numbers"]) -> Float[np.ndarray, " points"]:
-        """Return the error of each point."""
-        errors = []
+    def __call__(self, points: Float[np.ndarray, "points numbers"]) -> Tried:
+        """Return the error and deviation of each point."""
+        found = []
         with self._clock.running():
             for start in range(0, len(points), self._batch):
                 part = points[start : start + self._batch]
-                padded = np.resize(part, (self._batch, part.shape[1])).astype(np.float32)
-                errors.append(
-                    np.asarray(self._errors(*self._args, jnp.asarray(padded)))[: len(part)]
-                )
+                padded = np.resize(part, (self._batch, part.shape[1]))
+                points_here = jnp.asarray(padded, self._args[0].step.dtype)
+                found.append(np.asarray(self._errors(*self._args, points_here))[: len(part)])
         self.evaluations += len(points)
-        return np.concatenate(errors)
+        errors, deviations = np.concatenate(found).T
+        return Tried(errors, deviations)
 
 
 @eqx.filter_jit
 def _errors(
     space: BiasSpace, trial: Trial, filter: Filter, points: Float[Array, "points numbers"]
-) -> Float[Array, " points"]:
-    return lax.map(lambda vector: trial.error(space.bias(vector), filter), points)
+) -> Float[Array, "points 2"]:
+    def tried(vector: Float[Array, " numbers"]) -> Float[Array, "2"]:
+        visibility = trial.visibility(space.bias(vector), filter, HardCompare())
+        deviation = jnp.mean(jnp.abs(trial.goal.residual(visibility)))
+        return jnp.stack([trial.goal.error(visibility), deviation])
+
+    return lax.map(tried, points)
 
 
 def soft_residual(

@@ -21,6 +21,7 @@ from shadows.render import Rendering, Shading, receive_surface
 from shadows.shadow_map import Receiver, ShadowMap
 from tangentspace._math import dot
 
+from .checks import check_shadow_map
 from .metrics import ShadowErrors, contact_gap, shadow_errors
 from .render_scene import render_scene, shade_scene
 from .scene import Scene
@@ -160,6 +161,10 @@ class Study(NamedTuple):
         covered = np.asarray(self.unbiased.surface.covered)
         return shadow_errors(self.visibility(bias), self.truth, covered)
 
+    def objective(self, bias: Bias) -> float:
+        """Return the goal's error of a bias under hard comparison."""
+        return float(self.trial.goal.error(hard_visibility(self.trial, bias, self.filter)))
+
     def contact_gap(self, bias: Bias) -> float:
         """Return the world length of shadow that a bias takes away at contacts."""
         surface = self.unbiased.surface
@@ -207,7 +212,7 @@ def prepare_study(
         cull_front: Draw only faces turned away from the light into the map.
 
     Raises:
-        ValueError: If nothing that is seen faces the light.
+        ValueError: If nothing that is seen faces the light, or nothing is in its view.
     """
     unbiased = render_scene(
         scene,
@@ -220,6 +225,7 @@ def prepare_study(
         cull_front=cull_front,
     )
     light, surface, shadow_map = scene.lights[0], unbiased.surface, unbiased.shadow_map
+    check_shadow_map(scene, shadow_map, cull_front=cull_front)
     receiver = jax.jit(receive_surface)(surface, light, shadow_map)
     facing = np.asarray(surface.covered & (dot(receiver.normal, receiver.to_light) > 0))
     if not facing.any():
@@ -251,13 +257,15 @@ def with_target(
         limit: Where the target's format saturates: 1 for PNG.
 
     Raises:
-        ValueError: If the sizes differ.
+        ValueError: If the sizes differ, or a pixel is not finite.
     """
     if target.shape[:2] != study.facing.shape:
         raise ValueError(
             f"target image: expected height x width {study.facing.shape} as the view, "
             f"got {target.shape[:2]}; set the image size or scale the target"
         )
+    if not np.isfinite(target).all():
+        raise ValueError("target image: has pixels that are NaN or infinite; repair the image")
     unlit, lit = (study.picture(np.full(study.facing.shape, v, np.float32)) for v in (0.0, 1.0))
     goal = ImageGoal(
         unlit=jnp.asarray(unlit[study.facing]),

@@ -5,8 +5,10 @@ from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from shadows.lights import DirectionalLight, Light, PointLight, SpotLight
+from shadows.shadow_map import ShadowMap
 from shadows.transforms import transform_points
 
 from .scene import Scene
@@ -22,24 +24,46 @@ def check_size(option: str, *sizes: int) -> None:
 
 
 def check_folder(folder: Path) -> None:
-    """Make a folder, and refuse one that cannot be made or written to."""
+    """Refuse a folder that cannot be made or written to; nothing is made yet."""
+    there = next(place for place in (folder, *folder.parents) if place.exists())
+    if not there.is_dir():
+        raise ValueError(f"{folder}: {there} is a file, no folder; choose another folder")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise ValueError(f"{folder}: {there} cannot be written to; choose another folder")
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder and those that it lies in."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         reason = error.strerror or error
         raise ValueError(f"{folder}: cannot be made ({reason}); choose another folder") from error
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise ValueError(f"{folder}: cannot be written to; choose another folder")
 
 
 def check_out(path: Path, *suffixes: str) -> None:
     """Refuse an output file of another kind, or in a folder that is missing or read-only."""
     if path.suffix.lower() not in suffixes:
         raise ValueError(f"{path}: expected a name that ends in {' or '.join(suffixes)}")
+    if path.is_dir():
+        raise ValueError(f"{path}: is a folder; choose another name")
     if not path.parent.is_dir():
         raise ValueError(f"{path}: no folder {path.parent}; make it or choose another place")
     if not os.access(path.parent, os.W_OK | os.X_OK):
         raise ValueError(f"{path}: its folder cannot be written to; choose another place")
+
+
+def check_target(
+    path: Path, image: Float[np.ndarray, "height width 3"], size: tuple[int, int]
+) -> None:
+    """Refuse a target image of another size than the view, or with values that are not finite."""
+    if image.shape[:2] != size:
+        raise ValueError(
+            f"{path}: expected {size[0]} x {size[1]} pixels (height x width) as the view, got "
+            f"{image.shape[0]} x {image.shape[1]}; scale it or give --image-size"
+        )
+    if not np.isfinite(image).all():
+        raise ValueError(f"{path}: has pixels that are NaN or infinite; repair the image")
 
 
 def check_scene(scene: Scene) -> None:
@@ -62,6 +86,12 @@ def check_scene(scene: Scene) -> None:
     matrix = light.clip_from_world(jnp.asarray(positions))
     clip = np.asarray(transform_points(matrix, jnp.asarray(positions)))
     if not np.isfinite(clip).all() or np.all(clip[:, 3] <= 0):
+        raise ValueError(f"{scene.name}: nothing is in the light's view; move or turn the light")
+
+
+def check_shadow_map(scene: Scene, shadow_map: ShadowMap, *, cull_front: bool) -> None:
+    """Refuse an empty map, but for one that shows only faces turned away from the light."""
+    if not cull_front and not bool((shadow_map.depth < 1).any()):
         raise ValueError(f"{scene.name}: nothing is in the light's view; move or turn the light")
 
 

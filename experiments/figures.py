@@ -29,7 +29,7 @@ def error_picture(
     color: Image, visibility: Float[np.ndarray, "height width"], truth: Mask, covered: Mask
 ) -> Image:
     """Return the image in pale gray with acne in orange and leaks in blue, linear RGB."""
-    gray = 0.35 + 0.4 * np.clip(color.mean(axis=-1, keepdims=True), 0, 1)
+    gray = 0.6 + 0.35 * np.clip(color.mean(axis=-1, keepdims=True), 0, 1)
     picture = on_background(np.repeat(gray, 3, axis=-1), covered)
     picture[covered & truth & (visibility <= 0.5)] = _ACNE
     picture[covered & ~truth & (visibility >= 0.5)] = _LEAK

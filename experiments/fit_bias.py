@@ -4,8 +4,7 @@ Hard comparison counts right and wrong pixels and has no slope to follow; a soft
 Each level starts from where the last ended, with a harder comparison, so that the first
 sees how far every pixel is from its comparison and the last nearly what the hard one will.
 Of all points on the way from zero bias to each level's result, the one with the least
-error under hard comparison is kept, and of equal ones the smallest: shadow lost to a
-needlessly large bias is lost in the next picture if not in this one.
+error under hard comparison is kept, and of equal ones the one that deviates least on average.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,8 +24,8 @@ from shadows.filters import Filter
 from .bias_space import BiasSpace, Clock, Search, soft_residual, untold
 from .bias_study import Trial
 
-LEVELS = (1.0, 0.3, 0.1, 0.03)  # softness in half texels
-_STEPS_PER_LEVEL = 12
+LEVELS = (1.0, 0.3, 0.1)  # softness in half texels
+_STEPS_PER_LEVEL = 8
 _WAY = 32  # points tried between zero bias and a level's result
 
 Report = Callable[[str], None]
@@ -108,20 +107,19 @@ def fit_bias(
     softnesses = jnp.asarray(levels, zero.dtype)
     solve = clock.compiled(_solve, zero, space, trial, filter, softnesses[0])
     search = Search(space, trial, filter, clock, batch=_WAY)
-    best, best_error = np.zeros(zero.shape), float(search(np.zeros((1, *zero.shape)))[0])
+    best, score = np.zeros(zero.shape), search(np.zeros((1, *zero.shape))).score(0)
     vector, solved = zero, []
     for softness in softnesses:
         with clock.running():
             solution = jax.block_until_ready(solve(vector, space, trial, filter, softness))
         vector = solution.value
         way = np.linspace(0, 1, _WAY + 1)[1:, None] * np.asarray(vector)
-        errors = search(way)
-        nearest = int(np.argmin(errors))
-        if errors[nearest] < best_error:
-            best, best_error = way[nearest], float(errors[nearest])
+        tried = search(way)
+        if tried.score(tried.best) < score:
+            best, score = way[tried.best], tried.score(tried.best)
         result = _result(solution)
         steps = int(solution.stats["num_steps"])
-        end = Level(float(softness), space.values(vector), float(errors[-1]), steps, result)
+        end = Level(float(softness), space.values(vector), float(tried.errors[-1]), steps, result)
         solved.append(end)
         report(f"softness {end.softness:.2g}: error {end.error:.3%}, {steps} steps")
     point = jnp.asarray(best, zero.dtype)
@@ -129,7 +127,7 @@ def fit_bias(
         bias=space.bias(point),
         values=space.values(point),
         units=dict(zip(space.names, space.units, strict=True)),
-        error=best_error,
+        error=score[0],
         levels=tuple(solved),
         evaluations=search.evaluations + sum(level.steps for level in solved),
         seconds=clock.seconds,
@@ -156,7 +154,7 @@ def _solve(
     softness: Float[Array, ""],
 ) -> optx.Solution:
     """Minimize the soft residual; a few numbers and many pixels want the normal equations."""
-    solver = optx.LevenbergMarquardt(rtol=1e-2, atol=1e-3, linear_solver=lx.Normal(lx.Cholesky()))
+    solver = optx.LevenbergMarquardt(rtol=3e-2, atol=1e-3, linear_solver=lx.Normal(lx.Cholesky()))
     return optx.least_squares(
         lambda vector, _: soft_residual(vector, space, trial, filter, softness),
         solver,

@@ -12,8 +12,9 @@ import tyro
 from shadows.bias import Bias, CombinedBias
 from shadows.filters import Filter
 
-from .bias_study import Study, prepare_study, with_target
-from .checks import check_folder, check_scene, check_size
+from .bias_space import free_numbers
+from .bias_study import Study, TruthGoal, prepare_study, with_target
+from .checks import check_folder, check_scene, check_size, check_target, make_folder
 from .console import say, say_notes, say_table, stage
 from .figures import error_picture, on_background, save_comparison, save_curve
 from .fit_bias import BiasFit, fit_bias
@@ -60,7 +61,11 @@ def fit(
     bias: BiasWords = ("constant", "slope"),
     free: Annotated[
         tuple[str, ...],
-        tyro.conf.arg(metavar="NAME", help="Numbers to fit, as constant.length; default all."),
+        tyro.conf.arg(
+            metavar="NAME",
+            help="Numbers to fit, as constant.length; the others keep the values of --bias.",
+            help_behavior_hint="(default: all)",
+        ),
     ] = (),
     filter: FilterWord = "bilinear",
     image_size: ImageSize = (512, 512),
@@ -71,17 +76,22 @@ def fit(
     """Fit a shadow bias so that acne and leaks are least, and compare with a full sweep.
 
     Starts from zero bias. Writes before, after, truth and error pictures, the acne-leak
-    curve, EXR files, and summary.json with every figure.
+    curve, EXR files, and summary.json with every figure. In the table, "off edges" is the
+    error more than three pixels away from the edges of true shadows, and "gap" the world
+    length of shadow lost where casters touch.
     """
     check_folder(out)
     check_size("--image-size", *image_size)
     check_size("--shadow-map-size", shadow_map_size)
     terms = CombinedBias(parse_techniques(Bias, bias, option="--bias"))
-    lookup = parse_technique(Filter, [filter], option="--filter")
+    free_numbers(terms, free or None)
+    lookup = parse_technique(Filter, filter, option="--filter")
     goal = None if target is None else read_image(target)
+    if goal is not None and target is not None:
+        check_target(target, goal, image_size)
     with stage(f"loading {scene}"):
         loaded = load_scene(scene)
-    check_scene(loaded)
+        check_scene(loaded)
     say_notes(loaded.notes)
     with stage("rendering both passes and tracing the truth"):
         study = prepare_study(
@@ -95,6 +105,7 @@ def fit(
         if goal is not None and target is not None:
             limit = 1.0 if target.suffix.lower() == ".png" else np.inf
             study = with_target(study, goal, limit=limit)
+    make_folder(out)
     pictures = _Pictures(study, out)
     pictures.write("before", CombinedBias())
     pictures.write_truth()
@@ -203,6 +214,7 @@ def _summary(
         "contact_gap": {name: study.contact_gap(bias) for name, bias in biases.items()},
         "objective": {
             "name": study.trial.goal.unit,
+            "before": study.objective(CombinedBias()),
             "after": fitted.error,
             "sweep_best": swept.error,
         },
@@ -252,6 +264,10 @@ def _print_table(
     ]  # fmt: skip
     header = ["bias", "acne", "leak", "error", "off edges", "gap", "tried", "seconds"]
     say_table(study.scene.name, header, rows)
+    if not isinstance(study.trial.goal, TruthGoal):
+        name, *figures = summary["objective"].values()
+        said = ", ".join(f"{_NAMES[k]} {v:.4g}" for k, v in zip(errors, figures, strict=True))
+        say(f"{name}: {said}")
     for name, parameter in summary["parameters"].items():
         say(f"{name} = {parameter['after']:.5g} {parameter['unit']}")
     words = ", ".join(f"{level.softness:g} {level.result}" for level in fitted.levels)

@@ -14,8 +14,10 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import TypeVar
 
 import equinox as eqx
+import numpy as np
 
 Technique = TypeVar("Technique", bound=eqx.Module)
+_LARGEST = float(np.finfo(np.float32).max)
 
 
 def techniques(base: type[Technique]) -> dict[str, type[Technique]]:
@@ -48,16 +50,14 @@ def describe(base: type[eqx.Module]) -> list[str]:
     lines = []
     for name, cls in techniques(base).items():
         fields = dataclasses.fields(cls)
-        options = ", ".join(
-            f"{f.name} in {f.metadata['unit']}, default {f.default}" for f in fields
-        )
-        summary = (cls.__doc__ or "").splitlines()[0]
+        options = ", ".join(f"{f.name}, default {f.default} {f.metadata['unit']}" for f in fields)
+        summary = (cls.__doc__ or "").splitlines()[0].rstrip(".")
         lines.append(f"{name}{f' ({options})' if options else ''}: {summary}")
     return lines
 
 
 def parse_techniques(
-    base: type[Technique], words: Sequence[str], *, option: str
+    base: type[Technique], words: Sequence[str], *, option: str, least: float = -math.inf
 ) -> tuple[Technique, ...]:
     """Make techniques from words, in the order in which they are first named.
 
@@ -65,6 +65,7 @@ def parse_techniques(
         base: Where to look for classes.
         words: NAME, NAME=VALUE or NAME.FIELD=VALUE.
         option: Name of the command-line option, for error texts.
+        least: The least value that a number may have.
 
     Raises:
         ValueError: If a name, an option of it or a value is not understood.
@@ -75,42 +76,42 @@ def parse_techniques(
         head, has_value, text = word.partition("=")
         name, has_field, field = head.partition(".")
         if name not in known:
-            raise ValueError(f"{option} {word}: no such technique '{name}'; {_hint(name, known)}")
+            raise ValueError(f"{option} {word}: no such technique '{name}'; {hint(name, known)}")
         fields = [f.name for f in dataclasses.fields(known[name])]
         values = chosen.setdefault(name, {})
         if not has_value and not has_field:
             continue
         field = field if has_field else next(iter(fields), "")
         if field not in fields:
-            raise ValueError(
-                f"{option} {word}: '{name}' has no such number; {_hint(field, fields)}"
-            )
-        values[field] = _number(option, word, text)
+            raise ValueError(f"{option} {word}: '{name}' has no such number; {hint(field, fields)}")
+        values[field] = _number(option, word, text, least)
     return tuple(known[name](**values) for name, values in chosen.items())
 
 
-def parse_technique(base: type[Technique], words: Sequence[str], *, option: str) -> Technique:
-    """Make exactly one technique from words; see ``parse_techniques``."""
-    made = parse_techniques(base, words, option=option)
-    if len(made) != 1:
-        raise ValueError(f"{option}: expected one technique, got {len(made)}: {' '.join(words)}")
-    return made[0]
+def parse_technique(
+    base: type[Technique], word: str, *, option: str, least: float = -math.inf
+) -> Technique:
+    """Make the one technique that a word names; see ``parse_techniques``."""
+    return parse_techniques(base, [word], option=option, least=least)[0]
 
 
-def _number(option: str, word: str, text: str) -> float:
+def hint(name: str, known: Iterable[str]) -> str:
+    """Return the end of an error text: the name that is probably meant, or all names."""
+    known = list(known)
+    close = difflib.get_close_matches(name, known, n=1)
+    return f"did you mean '{close[0]}'?" if close else f"choose from: {', '.join(known) or 'none'}"
+
+
+def _number(option: str, word: str, text: str, least: float) -> float:
     try:
         value = float(text)
     except ValueError:
         raise ValueError(f"{option} {word}: expected a number after '=', got '{text}'") from None
-    if not math.isfinite(value):
+    if not abs(value) <= _LARGEST:
         raise ValueError(f"{option} {word}: expected a finite number, got {text}")
+    if value < least:
+        raise ValueError(f"{option} {word}: expected a number of at least {least:g}, got {text}")
     return value
-
-
-def _hint(name: str, known: Iterable[str]) -> str:
-    known = list(known)
-    close = difflib.get_close_matches(name, known, n=1)
-    return f"did you mean '{close[0]}'?" if close else f"choose from: {', '.join(known) or 'none'}"
 
 
 def _descendants(cls: type[Technique]) -> Iterator[type[Technique]]:

@@ -11,7 +11,7 @@ from shadows.compare import Compare
 from shadows.filters import Filter
 from shadows.render import Rendering
 
-from .checks import check_out, check_scene, check_size
+from .checks import check_out, check_scene, check_shadow_map, check_size
 from .console import say, say_notes, stage
 from .figures import on_background
 from .images import Channels, write_exr, write_png
@@ -33,14 +33,15 @@ BiasWords = Annotated[
     tuple[str, ...],
     tyro.conf.arg(
         metavar="NAME[=VALUE]",
-        help="Biases, one after another; none for no bias. " + "; ".join(describe(Bias)),
+        help="Biases, one after another; no word for no bias. " + "; ".join(describe(Bias)) + ".",
     ),
 ]
 CompareWord = Annotated[
-    str, tyro.conf.arg(metavar="NAME[=VALUE]", help="Comparison. " + "; ".join(describe(Compare)))
+    str,
+    tyro.conf.arg(metavar="NAME[=VALUE]", help="Comparison. " + "; ".join(describe(Compare)) + "."),
 ]
 FilterWord = Annotated[
-    str, tyro.conf.arg(metavar="NAME", help="Lookup. " + "; ".join(describe(Filter)))
+    str, tyro.conf.arg(metavar="NAME", help="Lookup. " + "; ".join(describe(Filter)) + ".")
 ]
 CullFront = Annotated[
     bool, tyro.conf.arg(help="Draw only faces turned away from the light into the shadow map.")
@@ -81,11 +82,11 @@ def render(
     check_size("--image-size", *image_size)
     check_size("--shadow-map-size", shadow_map_size)
     terms = CombinedBias(parse_techniques(Bias, bias, option="--bias"))
-    comparison = parse_technique(Compare, [compare], option="--compare")
-    lookup = parse_technique(Filter, [filter], option="--filter")
+    comparison = parse_technique(Compare, compare, option="--compare", least=0.0)
+    lookup = parse_technique(Filter, filter, option="--filter")
     with stage(f"loading {scene}"):
         loaded = load_scene(scene)
-    check_scene(loaded)
+        check_scene(loaded)
     say_notes(loaded.notes)
     with stage("compiling and rendering"):
         image = render_scene(
@@ -98,8 +99,9 @@ def render(
             shading=SHADINGS[shading],
             cull_front=cull_front,
         )
+    check_shadow_map(loaded, image.shadow_map, cull_front=cull_front)
     if not bool(image.surface.covered.any()):
-        say("note: the camera sees no surface; the image is empty")
+        say_notes(["the camera sees no surface; the image is empty"])
     if out.suffix.lower() == ".exr":
         write_exr(out, image_channels(image))
     for path in (png_out, out if out.suffix.lower() == ".png" else None):

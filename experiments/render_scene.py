@@ -18,7 +18,6 @@ from tangentspace.lighting import blinn_phong, lambert, phong
 
 from .scene import Scene, face_colors
 
-
 SHADINGS: dict[str, Shading] = {
     "blinn-phong": blinn_phong,
     "phong": phong,

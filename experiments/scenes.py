@@ -4,7 +4,6 @@ World units are arbitrary; each scene is a few units wide. Elevations are angles
 light over the floor. A new scene is a new function in ``EMBEDDED``.
 """
 
-import difflib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from tangentspace.mesh import Mesh
 from tangentspace.shapes import box, icosphere, merge, plane, transform_mesh
 
 from .mesh_file import load_scene_file
+from .options import hint
 from .scene import Material, Scene
 
 _UP = np.array([0.0, 1.0, 0.0], np.float32)
@@ -24,27 +24,29 @@ _UP = np.array([0.0, 1.0, 0.0], np.float32)
 def grazing_plane() -> Scene:
     """A bare floor under light 8 degrees high: nothing but acne can go wrong."""
     floor = plane(2.0)
-    return _scene("grazing-plane", [floor], eye=(0.0, 2.2, 3.4), light=_sun(8, 30))
+    return _scene("grazing-plane", [floor], eye=(0.0, 2.2, 3.4), light=_sun(8.0, 30.0))
 
 
 def thin_box() -> Scene:
     """A thin wall and a thin plate on a floor: a bias larger than they are loses shadow."""
     wall = _placed(box((0.8, 0.4, 0.01)), (0.0, 0.4, -0.3))
     plate = _placed(box((0.35, 0.02, 0.35)), (-0.2, 0.02, 0.75))
-    return _scene("thin-box", [plane(2.0), wall, plate], eye=(1.6, 2.2, 3.0), light=_sun(40, 160))
+    return _scene(
+        "thin-box", [plane(2.0), wall, plate], eye=(1.6, 2.2, 3.0), light=_sun(40.0, 160.0)
+    )
 
 
 def sphere() -> Scene:
     """A ball that hovers over a floor: every slope towards the light at once."""
     ball = _placed(icosphere(0.6, subdivisions=5), (0.0, 0.8, 0.0))
-    return _scene("sphere", [plane(2.0), ball], eye=(1.4, 1.9, 3.2), light=_sun(50, 210))
+    return _scene("sphere", [plane(2.0), ball], eye=(1.4, 1.9, 3.2), light=_sun(50.0, -60.0))
 
 
 def stacked() -> Scene:
     """Two plates one above the other over a floor: three depths behind one texel."""
     low = _placed(box((0.6, 0.02, 0.4)), (0.0, 0.3, 0.0))
     high = _placed(box((0.35, 0.02, 0.6)), (0.15, 0.8, 0.1))
-    return _scene("stacked", [plane(2.0), low, high], eye=(1.5, 2.0, 3.2), light=_sun(55, 200))
+    return _scene("stacked", [plane(2.0), low, high], eye=(1.5, 2.0, 3.2), light=_sun(55.0, 200.0))
 
 
 def spot() -> Scene:
@@ -66,7 +68,7 @@ def default() -> Scene:
         for x, height in ((-0.9, 0.002), (-0.2, 0.004), (0.5, 0.008))
     ]
     return _scene(
-        "default", [plane(2.0), ball, wall, *sheets], eye=(0.5, 2.1, 3.3), light=_sun(16, -62)
+        "default", [plane(2.0), ball, wall, *sheets], eye=(0.5, 2.1, 3.3), light=_sun(16.0, -62.0)
     )
 
 
@@ -89,9 +91,9 @@ def load_scene(name: str) -> Scene:
     if name in EMBEDDED:
         return EMBEDDED[name]()
     if not Path(name).exists() and not Path(name).suffix:
-        close = difflib.get_close_matches(name, EMBEDDED, n=1)
-        hint = f"did you mean '{close[0]}'?" if close else f"one of {', '.join(EMBEDDED)}"
-        raise ValueError(f"scene '{name}': neither a file nor an embedded scene; {hint}")
+        raise ValueError(
+            f"scene '{name}': neither a file nor an embedded scene; {hint(name, EMBEDDED)}"
+        )
     return load_scene_file(name)
 
 

@@ -1,20 +1,21 @@
 """Sweep a bias: every point of a grid from zero, so that a fit is judged against the best.
 
-The grid grows until its best point is not on its far border. Then its steps are halved until
+The grid grows until its best point is not on its far border, and its steps are halved until
 that changes the best error by less than 1 %: over the whole grid while that is affordable,
-after that over a window of eight steps round the best point.
+after that over a window of eight steps round the best point that moves with it.
 """
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from shadows.bias import CombinedBias
 from shadows.filters import Filter
 
-from .bias_space import BiasSpace, Clock, Search
+from .bias_space import BiasSpace, Clock, Search, Tried
 from .bias_study import Trial
 
 _BATCH = 256
@@ -80,40 +81,44 @@ def sweep_bias(
     search = Search(space, trial, filter, clock, batch=_BATCH)
     reach, count = np.full(dimensions, _FIRST_REACH), _FIRST_COUNT[dimensions]
 
-    def tried(low: np.ndarray, high: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    def tried(low: np.ndarray, high: np.ndarray, count: int) -> tuple[np.ndarray, Tried]:
         points = _grid(low, high, count)
-        errors = search(points)
-        report(f"{search.evaluations} biases: best error {errors.min():.3%}")
-        return points, errors
+        found = search(points)
+        report(f"{search.evaluations} biases: best error {found.errors.min():.3%}")
+        return points, found
 
+    best, score, converged = np.zeros(dimensions), (np.inf, np.inf), False
     while True:
-        points, errors = tried(np.zeros(dimensions), reach, count)
-        at_border = points[np.argmin(errors)] == reach
-        if not at_border.any() or reach.max() >= _LAST_REACH:
+        whole = points, found = tried(np.zeros(dimensions), reach, count)
+        gain, nearest = score[0] - found.errors.min(), points[found.best]
+        if found.score(found.best) < score:
+            best, score = nearest, found.score(found.best)
+        at_border = (nearest == reach) & (reach < _LAST_REACH)
+        if at_border.any():
+            reach = np.where(at_border, 2 * reach, reach)
+            continue
+        converged = bool(gain <= _CHANGE * score[0])
+        if converged or 2 * count - 1 > _LAST_COUNT[dimensions]:
             break
-        reach = np.where(at_border, 2 * reach, reach)
-    whole, step = (points, errors), reach / (count - 1)
-    best, best_error, converged = points[np.argmin(errors)], errors.min(), False
-    for _ in range(_HALVINGS):
+        count = 2 * count - 1
+    step = reach / (count - 1)
+    for _ in range(0 if converged else _HALVINGS):
         step = step / 2
-        if 2 * count - 1 <= _LAST_COUNT[dimensions]:
-            count = 2 * count - 1
-            whole = points, errors = tried(np.zeros(dimensions), reach, count)
-        else:
-            low = np.maximum(best - 2 * _WINDOW * step, 0)
-            points, errors = tried(low, best + 2 * _WINDOW * step, 4 * _WINDOW + 1)
-        converged = bool(best_error - errors.min() <= _CHANGE * best_error)
-        if errors.min() < best_error:
-            best, best_error = points[np.argmin(errors)], errors.min()
+        low, high = np.maximum(best - 2 * _WINDOW * step, 0), best + 2 * _WINDOW * step
+        points, found = tried(low, high, 4 * _WINDOW + 1)
+        gain, nearest = score[0] - found.errors.min(), points[found.best]
+        if found.score(found.best) < score:
+            best, score = nearest, found.score(found.best)
+        at_border = (nearest == high) | ((nearest == low) & (low > 0))
+        converged = bool(gain <= _CHANGE * score[0] and not at_border.any())
         if converged:
             break
-    best = best.astype(np.float32)
     return BiasSweep(
-        bias=space.bias(best),
+        bias=space.bias(jnp.asarray(best, space.step.dtype)),
         values=space.values(best),
-        error=float(best_error),
+        error=score[0],
         points=whole[0] * np.asarray(space.step),
-        errors=whole[1],
+        errors=whole[1].errors,
         evaluations=search.evaluations,
         seconds=clock.seconds,
         compile_seconds=clock.compile_seconds,

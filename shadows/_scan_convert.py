@@ -1,9 +1,10 @@
 """The geometry of scan conversion: rows of a face, spans of a row, and work lists.
 
 A face meets a row of pixels where it meets the plane through the eye and the row's centre
-line. That intersection is a segment in clip space whose two ends lie on two edges; clipped
-to the near plane and projected, it gives the span of pixels. So triangles are never split,
-and nothing is divided by a w that could vanish.
+line. That intersection is a segment in clip space whose two ends lie on two edges; its part
+in front of the eye, projected, gives the span of pixels, and near and far plane are left to
+each pixel's depth. So triangles are never split, no digits are lost to a vertex made close
+to the eye, and nothing is divided by a w that could vanish.
 
 The ends are computed from the two vertices of an edge in an order that does not depend on
 the face (the vertex on or above the row first), by the same operations: two faces that
@@ -77,19 +78,19 @@ def row_ranges(
     coordinate that is not finite have none.
     """
     x, y, z, w = clip
-    near = z + w
-    front = (near >= 0) & (w > 0)
+    front = w > 0
     row = 0.5 * height * (1 - y / jnp.where(front, w, 1))
     low = jnp.min(jnp.where(front, row, jnp.inf), axis=0)
     high = jnp.max(jnp.where(front, row, -jnp.inf), axis=0)
     for a, b in ((0, 1), (1, 2), (2, 0)):
         crosses = front[a] != front[b]
-        y_cut, w_cut = (near[a] * v[b] - near[b] * v[a] for v in (y, w))
-        cut = 0.5 * height * (1 - y_cut / jnp.where(crosses, w_cut, 1))
+        # Where w reaches 0 the image of the edge runs to infinity, up or down.
+        upwards = jnp.abs(w[a]) * y[b] + jnp.abs(w[b]) * y[a] > 0
+        cut = jnp.where(upwards, -jnp.inf, jnp.inf)
         low = jnp.minimum(low, jnp.where(crosses, cut, jnp.inf))
         high = jnp.maximum(high, jnp.where(crosses, cut, -jnp.inf))
     visible = jnp.any(front, axis=0) & jnp.all(jnp.isfinite(clip), axis=(0, 1))
-    for outside in (x < -w, x > w, z > w):
+    for outside in (x < -w, x > w, z < -w, z > w):
         visible &= ~jnp.all(outside, axis=0)
     if cull_back or cull_front:
         area = _area(x, y, w)
@@ -137,20 +138,14 @@ def spans(
     above = [h >= 0 for h in height_over_row]
     cut = _Cut(height_over_row, above)
     (x_p, x_q), (z_p, z_q), (w_p, w_q) = cut(x), cut(z), cut(w)
-    near_p, near_q = z_p + w_p, z_q + w_q
-    meets = ~((above[0] == above[1]) & (above[1] == above[2])) & ((near_p >= 0) | (near_q >= 0))
+    meets = ~((above[0] == above[1]) & (above[1] == above[2])) & ((w_p > 0) | (w_q > 0))
 
-    # Homogeneous ends on the near plane, where one end lies in front of it.
-    def clipped(p: Array, q: Array) -> tuple[Array, Array]:
-        return (
-            jnp.where(near_p < 0, near_q * p - near_p * q, p),
-            jnp.where(near_q < 0, near_p * q - near_q * p, q),
-        )
+    # An end behind the eye: the image of the segment runs to infinity where w reaches 0.
+    def project(x: Array, w: Array, other_x: Array, other_w: Array) -> Array:
+        column = x / jnp.where(w > 0, w, 1) * (0.5 * width) + (0.5 * width - 0.5)
+        return jnp.where(w > 0, column, jnp.where(other_w * x > w * other_x, jnp.inf, -jnp.inf))
 
-    ends = [
-        clipped_x / jnp.where(meets, clipped_w, 1) * (0.5 * width) + (0.5 * width - 0.5)
-        for clipped_x, clipped_w in zip(clipped(x_p, x_q), clipped(w_p, w_q), strict=True)
-    ]
+    ends = project(x_p, w_p, x_q, w_q), project(x_q, w_q, x_p, w_p)
     column = jnp.ceil(jnp.clip(jnp.minimum(*ends), 0, width))
     after = jnp.ceil(jnp.clip(jnp.maximum(*ends), 0, width))
     length = jnp.where(meets & (after > column), after - column, 0)

@@ -61,6 +61,9 @@ class SlopeBias(Bias):
     face, so on a plane the factor 1 is the least that removes all acne under nearest
     lookup and 2 under 2x2 bilinear, at every angle of the light and turn of the map.
 
+    As with OpenGL's polygon offset, what rounding cannot tell is added: a surface that faces
+    the light has no slope, and would shade itself at random.
+
     Attributes:
         factor: Texel footprints.
     """
@@ -69,7 +72,7 @@ class SlopeBias(Bias):
 
     def __call__(self, receiver: Receiver) -> Receiver:
         """Return the receiver with its depth lowered."""
-        return receiver.less_depth(self.factor * receiver.footprint)
+        return receiver.less_depth(self.factor * receiver.footprint + receiver.depth_resolution)
 
 
 class NormalOffsetBias(Bias):

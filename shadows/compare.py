@@ -44,7 +44,7 @@ class SoftCompare(Compare):
     ``visibility = sigmoid(margin / (softness * width))``, where ``width`` is the depth over
     half a texel of the receiver's surface: ``half * sqrt(slope**2 + 1)`` with the slope per
     texel, so that the step is as soft on a wall as on a floor, and positive everywhere.
-    Softness 0 is the hard comparison.
+    Softness 0 is the hard comparison. A texel without a surface blocks nothing at any softness.
 
     Attributes:
         softness: Width of the step, in half texels along the surface.
@@ -61,8 +61,10 @@ class SoftCompare(Compare):
         """Return visibility between 0 and 1."""
         margin = _margin(stored, receiver)
         across = 0.5 * jnp.abs(receiver.depth_rate) * receiver.texel_length
-        width = self.softness * jnp.sqrt(receiver.footprint**2 + across**2)
-        hard = width <= 0
+        squared = receiver.footprint**2 + across**2
+        flat = squared <= 0
+        width = self.softness * jnp.sqrt(jnp.where(flat, 1, squared))
+        hard = flat | (width <= 0) | (stored >= 1)
         soft = jax.nn.sigmoid(margin / jnp.where(hard, 1, width))
         return jnp.where(hard, (margin >= 0).astype(stored.dtype), soft)
 

@@ -15,6 +15,7 @@ References:
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float, Int
 
 from tangentspace._math import safe_divide, stack3
@@ -64,9 +65,15 @@ def barycentrics(
         rays.append((vertex_x - x * w, vertex_y - y[:, None] * w))
     areas = [rays[i][0] * rays[j][1] - rays[i][1] * rays[j][0] for i, j in ((1, 2), (2, 0), (0, 1))]
     facing = jnp.where(areas[0] + areas[1] + areas[2] < 0, -1, 1).astype(x.dtype)
-    areas = [jnp.where(area * facing < 0, 0, area * facing) for area in areas]
-    total = areas[0] + areas[1] + areas[2]
-    weights = [jnp.where(total == 0, 1 / 3, safe_divide(area, total)) for area in areas]
+    # Fused products leave a rounding error where the area is 0.
+    areas = [area * facing for area in areas]
+    reach = sum(jnp.abs(ray_x) + jnp.abs(ray_y) for ray_x, ray_y in rays)
+    flat = areas[0] + areas[1] + areas[2] <= jnp.finfo(x.dtype).eps * reach**2
+    # Rounding may put a centre outside its face: no weight is negative, but the derivative
+    # stays that of the plane.
+    areas = [area + lax.stop_gradient(jnp.maximum(-area, 0)) for area in areas]
+    total = jnp.where(flat, 0, areas[0] + areas[1] + areas[2])
+    weights = [jnp.where(flat, 1 / 3, safe_divide(area, total)) for area in areas]
     return jnp.where(covered[..., None], stack3(*weights), 0.0)
 
 

@@ -143,7 +143,8 @@ def _frustum(
     view_from_world = look_at(position, target, np.array([0.0, 1.0, 0.0]))
     view = transform_points(view_from_world, points)[:, :3]
     distance = -view[:, 2]
-    far = 1.01 * jnp.max(distance)
+    farthest = jnp.max(distance)
+    far = jnp.where(farthest > 0, 1.01 * farthest, 1.0)
     near = jnp.maximum(0.99 * jnp.min(distance), 1e-3 * far)
     in_front = jnp.maximum(distance, near)
     tangent = jnp.max(jnp.maximum(jnp.abs(view[:, 0]), jnp.abs(view[:, 1])) / in_front)

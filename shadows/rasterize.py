@@ -64,9 +64,9 @@ def rasterize(
 
     Follows OpenGL: y up in NDC (row 0 of the image is at NDC y = +1), only depths in
     [-1, 1] kept (near and far plane), a centre on a shared edge belongs to exactly one
-    face. Faces that cross the near plane or pass behind the eye are clipped, for
-    projections whose depth grows with distance; faces of zero area cover nothing; faces
-    with a coordinate that is not finite are left out.
+    face. Of faces that cross the near plane or pass behind the eye the visible part is
+    drawn; faces of zero area cover nothing; faces with a coordinate that is not finite are
+    left out.
 
     Args:
         clip_positions: Vertices in clip space; matrices applied, not yet divided by w.

@@ -103,7 +103,7 @@ def render_surface(mesh: Mesh, camera: Camera, *, image_size: tuple[int, int]) -
 def receive_surface(surface: Surface, light: Light, shadow_map: ShadowMap) -> Receiver:
     """Locate the pixels of a view in a light's shadow map."""
     height, width = shadow_map.depth.shape
-    viewport = texel_from_clip(height, width, shadow_map.depth.dtype)
+    viewport = texel_from_clip(height, width, dtype=shadow_map.depth.dtype)
     to_light = light.to_light(surface.position)
     matrix = viewport @ shadow_map.clip_from_world
     return receive(surface.position, surface.face_normal, to_light, matrix)

@@ -75,8 +75,9 @@ class Receiver(NamedTuple):
             the next; followed up to a slope of 100 (89.4 degrees).
         depth_per_row: The same from one row to the next.
         depth_rate: Window depth that a world length along the ray to the light is worth.
-        nearness: 1 over the distance to the light along its axis; 0 for parallel light.
-        texel_length: Width of a texel at the point, world units.
+        depth_resolution: Differences of window depth below this are rounding.
+        nearness: 1 over the distance to the light; 0 for parallel light.
+        texel_length: Width of a texel at the point, world units; its longer side.
         outside: True where the point lies behind the light or beyond the map's depths.
         position: World space.
         normal: Unit normal of the face, world space, on the side of the light or not.
@@ -91,6 +92,7 @@ class Receiver(NamedTuple):
     depth_per_column: Float[Array, "*points"]
     depth_per_row: Float[Array, "*points"]
     depth_rate: Float[Array, "*points"]
+    depth_resolution: Float[Array, "*points"]
     nearness: Float[Array, "*points"]
     texel_length: Float[Array, "*points"]
     outside: Bool[Array, "*points"]
@@ -165,10 +167,15 @@ def receive(
         _norm([matrix[axis, k] - texel * matrix[3, k] for k in range(3)])
         for axis, texel in enumerate((column, row))
     ]
-    texel_length = 2 * w / (density[0] + density[1])
+    texel_length = w / jnp.minimum(density[0], density[1])
+    # Bound of the rounding of ``matrix @ position``, in the window depth.
+    sizes = [jnp.abs(coordinate) for coordinate in point]
+    terms = [_affine(jnp.abs(matrix[k, :3]), sizes, jnp.abs(matrix[k, 3])) / w for k in (2, 3)]
+    resolution = 2 * jnp.finfo(depth.dtype).eps * (terms[0] + depth * terms[1])
     gradient = _depth_gradient(point, [normal[..., k] for k in range(3)], matrix)
     steepest = _STEEPEST * jnp.abs(depth_rate) * texel_length
-    limit = jnp.minimum(1, safe_divide(steepest, _norm(gradient)))
+    slope = _norm(gradient)
+    limit = jnp.where(slope > steepest, safe_divide(steepest, slope), 1)
     return Receiver(
         column,
         row,
@@ -177,6 +184,7 @@ def receive(
         gradient[0] * limit,
         gradient[1] * limit,
         depth_rate,
+        resolution,
         nearness,
         texel_length,
         behind | (depth > 1) | (depth < 0),

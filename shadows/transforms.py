@@ -87,7 +87,7 @@ def orthographic(
     return matrix.at[:3, 3].set(-(high + low) / (high - low))
 
 
-def texel_from_clip(height: int, width: int, dtype: DTypeLike = float) -> Float[Array, "4 4"]:
+def texel_from_clip(height: int, width: int, *, dtype: DTypeLike = float) -> Float[Array, "4 4"]:
     """Return the viewport: clip space to (column, row, window depth, 1) times w.
 
     The bias matrix of shadow mapping (NDC [-1, 1] to [0, 1]), with the image's size and

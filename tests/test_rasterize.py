@@ -27,8 +27,8 @@ from .tools import assert_close
 HEIGHT, WIDTH = 48, 64
 FACE_COUNT = 64
 SEPARATE = np.arange(3 * FACE_COUNT, dtype=np.int32).reshape(-1, 3)  # no shared vertices
-# Depth: times eps, times the condition. Measured: 1.24 in float32; 56 in float64, where the
-# oracle itself rounds (slivers), 2.1 without them.
+# Depth: times eps, times the condition. Measured over 40 seeds: 1.24 in float32; 56 in float64,
+# where the oracle itself rounds (slivers), 2.1 without them.
 ULPS = {np.dtype(np.float32): 2.5, np.dtype(np.float64): 112}
 MARGIN = 1e-5  # pixels, in float32; measured: not one of 840 000 covered pixels differs
 
@@ -240,8 +240,8 @@ def test_floor_from_behind_the_eye_to_the_horizon():
     distance = np.where(seen, -focal / y, 1.0)
     expected = np.where(seen, far * (distance - near) / ((far - near) * distance), 1.0)
     assert_close(raster.face_ids >= 0, seen)
-    # 68 measured, in 1/eps: the corners reach far behind the eye, where w cancels.
-    assert_close(raster.depth, expected, ulps=200)
+    # 11 measured: the corners reach far behind the eye, where w cancels.
+    assert_close(raster.depth, expected, ulps=64)
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
@@ -260,10 +260,13 @@ def test_of_equally_near_faces_the_lowest_index_wins():
     assert_close(draw(clip, SEPARATE[16:]).face_ids, reference.face_ids)
 
 
-def test_the_order_of_ties_holds_across_chunks():
+def test_indices_and_the_order_of_ties_hold_across_chunks():
+    """One half of the square 2999 times, the other half in the third chunk only."""
     clip, faces = quad(-1, 1, -1, 1)
     many = np.tile(faces[:1], (3000, 1))
-    assert np.max(jitted(clip, many, image_size=(8, 8), chunk=2**10).face_ids) == 0
+    many[2500] = faces[1]
+    face_ids = jitted(clip, many, image_size=(8, 8), chunk=2**10).face_ids
+    assert_close(face_ids, np.where(draw_small(clip, faces).face_ids == 0, 0, 2500))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -442,8 +445,8 @@ class TestSymmetries:
     def test_mirrored_winding_changes_nothing(self, clip):
         before, after = draw(clip, SEPARATE), draw(clip, SEPARATE[:, ::-1])
         assert_close(after.face_ids, before.face_ids)
-        # 16 measured around the eye, 1 elsewhere: a b - c d is rounded once or twice.
-        assert_close(after.depth, before.depth, ulps=64)
+        # 1.5 measured here, 16 for other seeds: a b - c d is rounded once or twice.
+        assert_close(after.depth, before.depth, ulps=32)
 
     @pytest.mark.parametrize("factor", [2.0**40, 2.0**-40, 3.0])
     def test_scaled_clip_coordinates_change_nothing(self, clip, factor):
@@ -582,7 +585,7 @@ def test_derivative_at_centres_on_an_edge_is_that_of_the_face_s_plane(seed):
         at_pixel = np.zeros((16, 16))
         at_pixel[row, column] = 1
         change = np.sum(depth_gradient(clip, faces, at_pixel)[:, 0] * w)
-        assert_close(change, -0.125, ulps=64)  # 7 measured
+        assert_close(change, -0.125, ulps=4)  # 0.13 measured
 
 
 NOTHING = {
@@ -691,8 +694,6 @@ def test_vmap_equals_a_loop():
         alone = one(batch[k], faces[k])
         assert_close(both.face_ids[k], alone.face_ids)
         assert_close(both.depth[k], alone.depth, ulps=1)
-    one_mesh = jax.vmap(one, in_axes=(None, 0))(batch[0], faces)
-    assert_close(one_mesh.face_ids[1], one(batch[0], faces[1]).face_ids)
 
 
 def test_same_shapes_are_traced_once():

@@ -1,0 +1,133 @@
+import abc
+import re
+
+import equinox as eqx
+import pytest
+
+from experiments.options import (
+    describe,
+    hint,
+    numbers,
+    parse_technique,
+    parse_techniques,
+    technique_name,
+    techniques,
+)
+from shadows.bias import Bias, CombinedBias, ConstantBias, NormalOffsetBias, SlopeBias
+from shadows.compare import Compare, HardCompare, SoftCompare
+from shadows.filters import BilinearFilter, Filter, NearestFilter
+
+
+class Toy(eqx.Module):
+    """A base with a class that is ready, one that is abstract and one that holds others."""
+
+
+class Halfway(Toy):
+    """Not ready.
+
+    Attributes:
+        width: Of something.
+    """
+
+    width: float = eqx.field(default=3.0, metadata={"unit": "feet"})
+
+    @abc.abstractmethod
+    def walk(self):
+        """Do nothing."""
+
+
+class LongWayToy(Halfway):
+    """Ready. With a second sentence."""
+
+    height: float = eqx.field(default=0.5, metadata={"unit": "inches"})
+
+    def walk(self):
+        """Do nothing."""
+
+
+class ManyToy(Toy):
+    """Holds others."""
+
+    toys: tuple[Toy, ...] = ()
+
+
+def test_words_become_techniques_in_their_order():
+    words = ["slope", "constant=0.02", "slope.factor=1.5"]
+    assert parse_techniques(Bias, words, option="--bias") == (SlopeBias(1.5), ConstantBias(0.02))
+
+
+def test_what_is_not_said_keeps_its_default():
+    made = parse_techniques(Bias, ["constant", "slope", "normal-offset"], option="--bias")
+    assert made == (ConstantBias(0.0), SlopeBias(2.0), NormalOffsetBias(1.0))
+    assert parse_techniques(Bias, [], option="--bias") == ()
+    assert parse_technique(Compare, "soft", option="--compare") == SoftCompare(0.5)
+
+
+def test_every_technique_of_shadows_is_found():
+    assert techniques(Bias) == {
+        "constant": ConstantBias,
+        "slope": SlopeBias,
+        "normal-offset": NormalOffsetBias,
+    }
+    assert techniques(Compare) == {"hard": HardCompare, "soft": SoftCompare}
+    assert techniques(Filter) == {"nearest": NearestFilter, "bilinear": BilinearFilter}
+    assert CombinedBias not in techniques(Bias).values()
+
+
+def test_a_new_class_is_found_by_its_name():
+    assert techniques(Toy) == {"long-way": LongWayToy}
+    assert technique_name(LongWayToy) == "long-way"
+    made = parse_technique(Toy, "long-way.height=7", option="--toy")
+    assert (made.width, made.height) == (3.0, 7.0)
+    assert parse_technique(Toy, "long-way=7", option="--toy").width == 7.0
+
+
+def test_a_description_names_numbers_defaults_and_units():
+    (line,) = describe(Toy)
+    assert line.startswith("long-way (")
+    assert line.endswith("): Ready. With a second sentence")
+    for part in ("width", "3.0 feet", "height", "0.5 inches"):
+        assert part in line
+    assert [line.partition(" (")[0] for line in describe(Bias)] == [*techniques(Bias)]
+
+
+def test_numbers_have_their_unit_and_full_name():
+    assert numbers(SlopeBias(1.5)) == {"slope.factor": (1.5, "texel footprints")}
+    assert numbers(HardCompare()) == {}
+
+
+@pytest.mark.parametrize(
+    ("word", "says"),
+    [
+        ("slop=1", "no such technique 'slop'; did you mean 'slope'?"),
+        ("", "no such technique ''; choose from: constant, slope, normal-offset"),
+        ("slope.fctor=1", "'slope' has no such number; did you mean 'factor'?"),
+        ("slope.factor.x=1", "has no such number"),
+        ("slope.factor", "expected a number after '=', got ''"),
+        ("slope=", "expected a number after '=', got ''"),
+        ("slope=two", "expected a number after '=', got 'two'"),
+        ("slope=1=2", "expected a number after '=', got '1=2'"),
+        ("slope=nan", "expected a finite number, got nan"),
+        ("slope=-inf", "expected a finite number, got -inf"),
+        ("slope=1e39", "expected a finite number, got 1e39"),  # infinite in single precision
+        ("slope=-0.5", "expected a number of at least 0, got -0.5"),
+    ],
+)
+def test_a_word_that_is_not_understood_is_named(word, says):
+    with pytest.raises(ValueError, match=f"^--bias {re.escape(word)}: .*{re.escape(says)}"):
+        parse_techniques(Bias, ["constant", word], option="--bias", least=0.0)
+
+
+def test_a_number_for_a_technique_without_numbers_is_refused():
+    with pytest.raises(ValueError, match="--compare hard=1: 'hard' has no such number"):
+        parse_technique(Compare, "hard=1", option="--compare")
+
+
+def test_numbers_may_be_negative_where_nothing_forbids_it():
+    assert parse_techniques(Bias, ["constant=-1"], option="--bias") == (ConstantBias(-1.0),)
+
+
+def test_hint():
+    assert hint("spehre", ["spot", "sphere"]) == "did you mean 'sphere'?"
+    assert hint("xyz", ["spot", "sphere"]) == "choose from: spot, sphere"
+    assert hint("xyz", []) == "choose from: none"
