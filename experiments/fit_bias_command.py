@@ -37,11 +37,11 @@ from .render_scene import SHADINGS
 from .scenes import load_scene
 from .sweep_bias import BiasSweep, sweep_bias
 
-_TOO_LARGE = 16  # times the fitted bias, to show what is lost
+_TOO_LARGE = 16.0  # times the fitted bias, to show what is lost
 _NAMES = {
     "before": "zero bias",
     "after": "fitted bias",
-    "too_large": f"{_TOO_LARGE} x fitted bias",
+    "too_large": f"{_TOO_LARGE:g} x fitted bias",
     "sweep_best": "best of sweep",
 }
 

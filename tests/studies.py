@@ -19,19 +19,19 @@ _VERTICES, _FACES = 10_300, 20_500  # what the largest scene needs
 
 
 @functools.cache
-def study(name, filter=BilinearFilter()):
-    """Return the study of an embedded scene."""
-    return study_of(load_scene(name), filter)
+def study(name: str) -> Study:
+    """Return the study of an embedded scene under 2x2 lookup."""
+    return study_of(load_scene(name))
 
 
-def study_of(scene: Scene, filter=BilinearFilter()) -> Study:
+def study_of(scene: Scene) -> Study:
     """Return the study of a scene; all have meshes of one size, so they compile once."""
     with jax.enable_x64(False):
         return prepare_study(
             padded(scene),
             image_size=IMAGE_SIZE,
             map_size=MAP_SIZE,
-            filter=filter,
+            filter=BilinearFilter(),
             shading=SHADINGS["blinn-phong"],
         )
 

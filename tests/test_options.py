@@ -78,8 +78,8 @@ def test_a_new_class_is_found_by_its_name():
     assert techniques(Toy) == {"long-way": LongWayToy}
     assert technique_name(LongWayToy) == "long-way"
     made = parse_technique(Toy, "long-way.height=7", option="--toy")
-    assert (made.width, made.height) == (3.0, 7.0)
-    assert parse_technique(Toy, "long-way=7", option="--toy").width == 7.0
+    assert made == LongWayToy(3.0, 7.0)
+    assert parse_technique(Toy, "long-way=7", option="--toy") == LongWayToy(7.0, 0.5)
 
 
 def test_a_description_names_numbers_defaults_and_units():

@@ -6,7 +6,7 @@ import pytest
 
 from experiments.scenes import EMBEDDED, load_scene
 from shadows.bias import CombinedBias, ConstantBias, SlopeBias
-from shadows.lights import SpotLight
+from shadows.lights import DirectionalLight, SpotLight
 
 from .studies import study
 
@@ -20,9 +20,11 @@ def _single_precision():
         yield
 
 
-def elevation(scene):
-    """Return the angle of the light over the floor in degrees."""
-    return np.rad2deg(np.arcsin(scene.lights[0].direction[1]))
+def to_sun(scene):
+    """Return the direction to the scene's parallel light."""
+    light = scene.lights[0]
+    assert isinstance(light, DirectionalLight)
+    return np.asarray(light.direction)
 
 
 def surface(of):
@@ -48,7 +50,9 @@ def test_a_scene_is_sound(name):
     assert set(np.unique(faces)) == set(range(len(positions)))
     assert len(scene.face_materials) == len(faces)
     assert (positions[:, 1] >= FLOOR - 1e-6).all()
-    np.testing.assert_allclose(np.linalg.norm(scene.lights[0].direction), 1, rtol=1e-6)
+    light = scene.lights[0]
+    assert isinstance(light, DirectionalLight | SpotLight)
+    np.testing.assert_allclose(np.linalg.norm(light.direction), 1, rtol=1e-6)
 
 
 @pytest.mark.parametrize("name", EMBEDDED)
@@ -83,7 +87,8 @@ def test_what_is_no_embedded_scene_is_a_file(tmp_path):
 def test_grazing_plane_is_a_bare_floor_under_low_light():
     plane = study("grazing-plane")
     assert np.ptp(load_scene("grazing-plane").mesh.positions[:, 1]) == 0
-    np.testing.assert_allclose(elevation(plane.scene), 8, rtol=1e-5)
+    elevation = np.rad2deg(np.arcsin(to_sun(plane.scene)[1]))
+    np.testing.assert_allclose(elevation, 8, rtol=1e-5)
     assert plane.truth[surface(plane)[2]].all()
     assert plane.errors(CombinedBias((SlopeBias(2.0),))).error == 0
 
@@ -106,7 +111,7 @@ def test_thin_box_loses_shadow_to_a_bias_larger_than_its_boxes():
 def test_sphere_shows_every_slope_towards_the_light():
     ball = study("sphere")
     _, normal, covered = surface(ball)
-    cosine = normal[covered] @ ball.scene.lights[0].direction
+    cosine = normal[covered] @ to_sun(ball.scene)
     counts, _ = np.histogram(cosine[cosine > 0], bins=10, range=(0, 1))
     assert (counts > 0).all()
     heights = load_scene("sphere").mesh.positions[:, 1]
@@ -121,7 +126,7 @@ def test_stacked_has_three_depths_behind_one_texel():
     assert low_top.sum() > 20  # the low plate lies in the shadow of the high one
     # Of the shadowed points of the low plate, some have the floor behind them: the ray goes on
     # down past the plate and meets the floor within the scene.
-    ray = stack.scene.lights[0].direction
+    ray = to_sun(stack.scene)
     foot = position[low_top] - position[low_top][:, 1:2] / ray[1] * ray
     assert (np.abs(foot[:, ::2]) < 2).all()
 
