@@ -17,8 +17,10 @@ from experiments.scene import Material, Scene
 from experiments.scenes import EMBEDDED
 from experiments.sweep_bias import sweep_bias
 from shadows.bias import CombinedBias, ConstantBias, NormalOffsetBias, SlopeBias
+from shadows.compare import HardCompare
 from shadows.filters import BilinearFilter, NearestFilter
 from shadows.lights import DirectionalLight
+from shadows.render import surface_visibility
 from shadows.transforms import PerspectiveCamera, look_at
 from tangentspace.shapes import merge, plane
 
@@ -87,6 +89,13 @@ def test_a_fit_says_the_error_of_the_bias_that_it_returns(name):
         values = {"constant.length": constant, "slope.factor": slope}
         assert found.values == pytest.approx(values, rel=1e-6)
     assert fit.units == {"constant.length": "world length", "slope.factor": "texel footprints"}
+
+
+def test_a_fit_keeps_the_best_of_its_way():
+    trial, _, _ = outcome("thin-box")
+    fit = fit_bias(trial, BOTH, LINEAR, levels=(0.3, 30.0))  # too soft in the end
+    good, bad = (level.error for level in fit.levels)
+    assert fit.error <= good < 0.02 < bad
 
 
 def test_a_sweep_tries_the_best_bias_of_its_grid():
@@ -253,6 +262,32 @@ def test_a_trial_counts_what_the_metrics_count():
     zero = default.errors(CombinedBias())
     assert_close(np.float32(hard_error(default.trial, CombinedBias())), zero.error)
     assert_close(np.float32(default.objective(CombinedBias())), zero.error)
+
+
+@pytest.mark.parametrize(
+    "bias",
+    [
+        CombinedBias(),
+        CombinedBias((ConstantBias(0.01), SlopeBias(1.0))),
+        CombinedBias((NormalOffsetBias(2.0),)),
+        CombinedBias((NormalOffsetBias(3.0), SlopeBias(0.5))),
+    ],
+)
+def test_a_trial_sees_what_a_whole_rendering_shows(bias):
+    default = study("default")
+    _, surface, shadow_map = default.unbiased[1:]
+    whole = jax.jit(
+        lambda surface, shadow_map, bias: surface_visibility(
+            surface,
+            default.scene.lights[0],
+            shadow_map,
+            bias=bias,
+            filter=LINEAR,
+            compare=HardCompare(),
+        )
+    )(surface, shadow_map, bias)
+    differ = np.abs(np.asarray(whole) - default.visibility(bias)) > 1e-6
+    assert differ.mean() < 1e-3  # compiled apart, rounding decides between equal depths
 
 
 def test_the_goal_of_an_image_is_its_difference_in_radiance():
