@@ -18,6 +18,7 @@ from PIL import Image
 import experiments.fit_bias_command
 import experiments.render_command
 from experiments.__main__ import main
+from experiments.console import say_table, stage
 from experiments.images import read_exr, read_image, write_exr, write_png
 from experiments.scenes import EMBEDDED
 from shadows.bias import CombinedBias, ConstantBias, SlopeBias
@@ -33,10 +34,18 @@ TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
 PICTURES = ["before", "after", "too_large", "sweep_best"]
 
 
-def start(*arguments, cwd):
+# A program that a shell started in the background ignores interrupts, and so do its children.
+INTERRUPTIBLE = """
+import runpy, signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+runpy.run_module("experiments", run_name="__main__", alter_sys=True)
+"""
+
+
+def start(*arguments, cwd, program=("-m", "experiments")):
     """Start a program of its own, as a user does."""
     return subprocess.Popen(
-        [sys.executable, "-m", "experiments", *arguments],
+        [sys.executable, *program, *arguments],
         cwd=cwd,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         stdout=subprocess.PIPE,
@@ -220,7 +229,8 @@ def test_bad_input_to_a_whole_program(tmp_path):
 
 
 def test_an_interrupt_leaves_whole_files_and_says_so(tmp_path):
-    program = start("fit-bias", "thin-box", "--out", "made", *SMALL, cwd=tmp_path)
+    arguments = ["fit-bias", "thin-box", "--out", "made", *SMALL]
+    program = start(*arguments, cwd=tmp_path, program=("-c", INTERRUPTIBLE))
     assert program.stderr.readline().startswith("loading thin-box")  # it is at work
     program.send_signal(signal.SIGINT)
     code, _, err = finish(program)
@@ -432,6 +442,23 @@ def test_a_fault_of_ours_keeps_its_traceback(run, monkeypatch):
     monkeypatch.setattr(experiments.render_command, "render_scene", fail)
     with pytest.raises(jax.errors.JaxRuntimeError, match="INTERNAL"):
         run("render", "--out", "a.png")
+
+
+def test_a_table_is_never_cut(capsys):
+    say_table("[all]", ["name", "number"], [["n" * 70, "1" * 60]])
+    out = capsys.readouterr().out
+    for words in ("[all]", "n" * 70, "1" * 60):
+        assert words in out
+
+
+def test_a_stage_is_said_once_it_went_well(capsys):
+    with stage("good [red]") as report:
+        report("half of it [red]")
+    with pytest.raises(ValueError, match="bad"), stage("bad"):
+        raise ValueError("bad")
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert re.fullmatch(r"good \[red\]: \d+\.\d s\n", err)
 
 
 # The README

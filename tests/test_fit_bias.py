@@ -92,8 +92,8 @@ def test_a_fit_says_the_error_of_the_bias_that_it_returns(name):
 
 
 def test_a_fit_keeps_the_best_of_its_way():
-    trial, _, _ = outcome("thin-box")
-    fit = fit_bias(trial, BOTH, LINEAR, levels=(0.3, 30.0))  # too soft in the end
+    trial, _, _ = outcome("default")
+    fit = fit_bias(trial, BOTH, LINEAR, levels=(0.3, 3000.0))  # far too soft in the end
     good, bad = (level.error for level in fit.levels)
     assert fit.error <= good < 0.02 < bad
 
