@@ -8,9 +8,17 @@ only see angles. Leading axes broadcast, so one function serves a pixel and an i
 blocked; both scale diffuse and specular, while ambient stays. There is no factor 1 / pi:
 a white Lambert surface that faces light of radiance 1 shows color 1.
 
+``gloss`` says how far bumps that are finer than a pixel spread a highlight: a factor on its
+exponent, from the filtering of normal maps. With it each model also lowers the highlight's
+peak, so that its energy stays; 1, the default, changes and costs nothing.
+
 Sources: Phong, "Illumination for Computer Generated Pictures", 1975; Blinn, "Models of
-Light Reflection for Computer Synthesized Pictures", 1977.
+Light Reflection for Computer Synthesized Pictures", 1977; Toksvig, "Mipmapping Normal Maps", 2004.
 """
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +29,21 @@ from ._math import dot, safe_normalize
 Directions = Float[Array | np.ndarray, "... 3"]
 Scalars = Float[Array | np.ndarray, "..."] | float
 Colors = Float[Array | np.ndarray, "... 3"] | Float[Array | np.ndarray, ""] | float
+ShadingFunction = Callable[..., Float[Array, "... 3"]]
+
+
+class IncomingLight(NamedTuple):
+    """What arrives at a surface from one light.
+
+    Attributes:
+        to_light: Unit vectors from the surface to the light.
+        radiance: Linear light that arrives unblocked, RGB or one number.
+        visibility: Share of the light that is not blocked, in [0, 1].
+    """
+
+    to_light: Directions
+    radiance: Colors = 1.0
+    visibility: Scalars = 1.0
 
 
 def reflect(incident: Directions, normal: Directions) -> Float[Array, "... 3"]:
@@ -40,10 +63,12 @@ def lambert(
     to_camera: Directions | None = None,
     *,
     albedo: Colors,
+    ambient: Colors = 0.0,
     radiance: Colors = 1.0,
     visibility: Scalars = 1.0,
+    gloss: Scalars = 1.0,
 ) -> Float[Array, "... 3"]:
-    """Shade a matte surface: ``visibility * radiance * albedo * clamp(<n, l>, 0, 1)``.
+    """Shade matte: ``ambient + visibility * radiance * albedo * clamp(<n, l>, 0, 1)``.
 
     Args:
         normal: Unit normals.
@@ -51,18 +76,21 @@ def lambert(
         to_camera: Not used, since a matte surface looks the same from everywhere; taken so
             that one model can stand in for another.
         albedo: Linear RGB, or one number for all channels.
+        ambient: Linear RGB or one number; what remains in full shadow.
         radiance: Linear light that arrives unblocked, RGB or one number.
         visibility: Share of the light that is not blocked, in [0, 1].
+        gloss: Not used, since there is no highlight; taken as ``to_camera`` is.
 
     Returns:
         Linear RGB.
 
     Differentiability:
         Smooth but for the clamp: at and below ``<n, l> = 0`` the derivative is zero, as it
-        is at and above 1. Linear in ``albedo``, ``radiance`` and ``visibility``.
+        is at and above 1. Linear in all colors and in ``visibility``.
     """
-    n_dot_l = _clamp(dot(normal, to_light))
-    return _rgb(_arriving(radiance, visibility * n_dot_l) * jnp.asarray(albedo))
+    n_dot_l = clamp_cosine(dot(normal, to_light))
+    reflected = _arriving(radiance, visibility * n_dot_l) * jnp.asarray(albedo)
+    return _rgb(jnp.asarray(ambient) + reflected)
 
 
 def phong(
@@ -76,6 +104,7 @@ def phong(
     shininess: Scalars = 1.0,
     radiance: Colors = 1.0,
     visibility: Scalars = 1.0,
+    gloss: Scalars = 1.0,
 ) -> Float[Array, "... 3"]:
     """Shade with Phong's model; the defaults are the lecture form, which has no exponent.
 
@@ -94,6 +123,10 @@ def phong(
         shininess: Exponent of the highlight, > 0.
         radiance: Linear light that arrives unblocked, RGB or one number.
         visibility: Share of the light that is not blocked, in [0, 1].
+        gloss: Factor on the exponent, in (0, 1]. The peak is lowered by
+            ``(1 + gloss * shininess) / (1 + shininess)``. A lobe round the mirror direction is
+            as wide as one round the half vector with four times its exponent: to filter a
+            map for this model, ask for the gloss at ``4 * shininess``.
 
     Returns:
         Linear RGB, not clamped to 1.
@@ -102,8 +135,10 @@ def phong(
         Smooth but for the two clamps; where a cosine is at or below 0, or at or above 1,
         its term has derivative zero, for every ``shininess``.
     """
-    n_dot_l = _clamp(dot(normal, to_light))
-    highlight = _lobe(dot(to_camera, reflect(-to_light, normal)), shininess)
+    n_dot_l = clamp_cosine(dot(normal, to_light))
+    highlight = lobe(dot(to_camera, reflect(-to_light, normal)), shininess * gloss)
+    if not (isinstance(gloss, float) and gloss == 1.0):
+        highlight = highlight * ((1 + shininess * gloss) / (1 + shininess))
     reflected = jnp.asarray(albedo) * n_dot_l[..., None] + specular * highlight[..., None]
     return _rgb(jnp.asarray(ambient) + _arriving(radiance, visibility) * reflected)
 
@@ -119,6 +154,7 @@ def blinn_phong(
     shininess: Scalars = 32.0,
     radiance: Colors = 1.0,
     visibility: Scalars = 1.0,
+    gloss: Scalars = 1.0,
 ) -> Float[Array, "... 3"]:
     """Shade with Blinn-Phong's model as a normalized reflectance.
 
@@ -138,6 +174,7 @@ def blinn_phong(
         shininess: Exponent ``s`` of the highlight, > 0.
         radiance: Linear light that arrives unblocked, RGB or one number.
         visibility: Share of the light that is not blocked, in [0, 1].
+        gloss: Factor on the exponent, in (0, 1], also in ``c``.
 
     Returns:
         Linear RGB, not clamped to 1.
@@ -149,12 +186,49 @@ def blinn_phong(
     References:
         C. Schueler, "The Blinn-Phong Normalization Zoo", 2011.
     """
-    n_dot_l = _clamp(dot(normal, to_light))
+    n_dot_l = clamp_cosine(dot(normal, to_light))
     half_vector = safe_normalize(to_light + to_camera)
-    normalization = (shininess + 2) * (shininess + 4) / (8 * (shininess + 2 ** (-shininess / 2)))
-    lobe = normalization * _lobe(dot(normal, half_vector), shininess)
-    reflectance = jnp.asarray(albedo) + specular * lobe[..., None]
+    exponent = shininess * gloss
+    normalization = (exponent + 2) * (exponent + 4) / (8 * (exponent + 2 ** (-exponent / 2)))
+    highlight = normalization * lobe(dot(normal, half_vector), exponent)
+    reflectance = jnp.asarray(albedo) + specular * highlight[..., None]
     return _rgb(jnp.asarray(ambient) + _arriving(radiance, visibility * n_dot_l) * reflectance)
+
+
+def shade_lights(
+    shading: ShadingFunction,
+    normal: Directions,
+    to_camera: Directions,
+    lights: Sequence[IncomingLight],
+) -> Float[Array, "... 3"]:
+    """Shade under several lights; ambient, which comes from none of them, counts once.
+
+    Args:
+        shading: ``lambert``, ``phong``, ``blinn_phong`` or a function with their keywords,
+            its material bound: ``functools.partial(phong, albedo=color)``. Called with its
+            own ``ambient`` for the first light and with ``ambient=0.0`` for the others.
+        normal: Unit normals.
+        to_camera: Unit vectors from the surface to the camera.
+        lights: At least one.
+
+    Returns:
+        Linear RGB, not clamped to 1.
+
+    Raises:
+        ValueError: If there is no light.
+    """
+    if not lights:
+        raise ValueError(
+            "shade_lights: expected at least one of `lights`, got none; "
+            "for a surface in the dark pass a light of visibility 0"
+        )
+    first, *others = (
+        functools.partial(
+            shading, normal, to_light, to_camera, radiance=radiance, visibility=visibility
+        )
+        for to_light, radiance, visibility in lights
+    )
+    return sum((shade(ambient=0.0) for shade in others), first())
 
 
 def _arriving(radiance: Colors, share: Scalars) -> Float[Array, "..."]:
@@ -162,15 +236,15 @@ def _arriving(radiance: Colors, share: Scalars) -> Float[Array, "..."]:
     return jnp.asarray(share)[..., None] * jnp.asarray(radiance)
 
 
-def _clamp(cosine: Float[Array, "..."]) -> Float[Array, "..."]:
+def clamp_cosine(cosine: Float[Array, "..."]) -> Float[Array, "..."]:
     """Clamp to [0, 1], with derivative 0 at both ends (``jnp.clip`` halves it there)."""
     return jnp.where(cosine <= 0, 0.0, jnp.where(cosine >= 1, 1.0, cosine))
 
 
-def _lobe(cosine: Float[Array, "..."], shininess: Scalars) -> Float[Array, "..."]:
+def lobe(cosine: Float[Array, "..."], shininess: Scalars) -> Float[Array, "..."]:
     """Raise the clamped cosine to a power, whose derivative at 0 is 0 for any exponent."""
     dark = cosine <= 0
-    return jnp.where(dark, 0.0, jnp.where(dark, 1.0, _clamp(cosine)) ** shininess)
+    return jnp.where(dark, 0.0, jnp.where(dark, 1.0, clamp_cosine(cosine)) ** shininess)
 
 
 def _rgb(color: Float[Array, "..."]) -> Float[Array, "... 3"]:
