@@ -23,8 +23,8 @@ from shadows.lights import Light
 from shadows.rasterize import rasterize
 from shadows.render import Rendering, render
 from shadows.transforms import Camera, transform_points
-from tangentspace.lighting import blinn_phong
 from tangentspace.mesh import Mesh
+from tangentspace.shading import BlinnPhongShading
 from tangentspace.shapes import icosphere, merge, plane, transform_mesh
 
 from .bias_study import Trial, prepare_study, with_target
@@ -138,7 +138,7 @@ def _time_render(scene: Scene, runs: int) -> dict[str, Any]:
         )
 
     study = prepare_study(
-        scene, image_size=_IMAGE, map_size=_MAP, filter=lookup, shading=blinn_phong
+        scene, image_size=_IMAGE, map_size=_MAP, filter=lookup, shading=BlinnPhongShading()
     )
     trial = with_target(study, study.picture(study.truth.astype(np.float32))).trial
 

@@ -14,6 +14,7 @@ import tyro
 
 from shadows.bias import CombinedBias, ConstantBias, SlopeBias
 from shadows.filters import BilinearFilter
+from tangentspace.shading import BlinnPhongShading
 
 from .bias_study import prepare_study
 from .checks import check_out
@@ -21,8 +22,7 @@ from .console import say_table, stage
 from .fit_bias import fit_bias
 from .images import atomic_path
 from .provenance import commit, device, versions
-from .render_scene import SHADINGS
-from .scenes import EMBEDDED, load_scene
+from .scenes import SHADOW_SCENES, load_scene
 from .sweep_bias import sweep_bias
 
 
@@ -37,7 +37,7 @@ def bench_fit(
     """Fit constant and slope on every scene, 512 x 512 pixels and a map of 1024."""
     check_out(out, ".json")
     rows = []
-    for name in (*EMBEDDED, *meshes):
+    for name in (*SHADOW_SCENES, *meshes):
         with stage(f"fitting {Path(name).stem}"):
             rows.append(_row(name, runs))
     made_with = {"versions": versions(), "device": device(), "commit": commit()}
@@ -72,7 +72,7 @@ def _row(name: str, runs: int) -> dict[str, Any]:
         image_size=(512, 512),
         map_size=1024,
         filter=lookup,
-        shading=SHADINGS["blinn-phong"],
+        shading=BlinnPhongShading(),
     )
     both = [
         (fit_bias(study.trial, terms, lookup), sweep_bias(study.trial, terms, lookup))

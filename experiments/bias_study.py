@@ -17,9 +17,10 @@ from jaxtyping import Array, Bool, Float
 from shadows.bias import Bias, CombinedBias
 from shadows.compare import Compare, HardCompare
 from shadows.filters import Filter, Tap, compare_taps, look_up
-from shadows.render import Rendering, Shading, receive_surface
+from shadows.render import Rendering, receive_surface
 from shadows.shadow_map import Receiver, ShadowMap
 from tangentspace._math import dot
+from tangentspace.shading import Shading
 
 from .checks import check_shadow_map
 from .metrics import ShadowErrors, contact_gap, shadow_errors
@@ -182,8 +183,9 @@ class Study(NamedTuple):
         self, visibility: Float[np.ndarray, "height width"]
     ) -> Float[np.ndarray, "height width 3"]:
         """Return the image, linear RGB, lit with a given visibility."""
-        light, surface = self.scene.lights[0], self.unbiased.surface
-        return np.asarray(shade_scene(self.scene, surface, light, visibility, self.shading))
+        lights = self.scene.lights[:1]
+        color = shade_scene(self.scene, self.unbiased, lights, [visibility], self.shading)
+        return np.asarray(color)
 
 
 @eqx.filter_jit
@@ -208,12 +210,13 @@ def prepare_study(
         image_size: Height and width in pixels.
         map_size: Texels on each side of the shadow map.
         filter: Which texels are asked.
-        shading: A function of ``tangentspace.lighting``, or one with its signature.
+        shading: The lighting model of the pictures.
         cull_front: Draw only faces turned away from the light into the map.
 
     Raises:
         ValueError: If nothing that is seen faces the light, or nothing is in its view.
     """
+    scene = scene._replace(lights=scene.lights[:1])
     unbiased = render_scene(
         scene,
         image_size=image_size,
@@ -224,7 +227,7 @@ def prepare_study(
         shading=shading,
         cull_front=cull_front,
     )
-    light, surface, shadow_map = scene.lights[0], unbiased.surface, unbiased.shadow_map
+    light, surface, shadow_map = scene.lights[0], unbiased.surface, unbiased.shadow_maps[0]
     check_shadow_map(scene, shadow_map, cull_front=cull_front)
     receiver = jax.jit(receive_surface)(surface, light, shadow_map)
     facing = np.asarray(surface.covered & (dot(receiver.normal, receiver.to_light) > 0))

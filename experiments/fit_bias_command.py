@@ -21,6 +21,7 @@ from .fit_bias import BiasFit, fit_bias
 from .images import atomic_path, read_image, write_exr, write_png
 from .metrics import ShadowErrors
 from .options import parse_technique, parse_techniques
+from .prepare_scene import prepare_scene
 from .provenance import commit, device, versions
 from .render_command import (
     BiasWords,
@@ -29,11 +30,11 @@ from .render_command import (
     ImageSize,
     MapSize,
     SceneName,
-    ShadingName,
+    ShadingWords,
     image_channels,
+    parse_shading,
     shadow_map_channels,
 )
-from .render_scene import SHADINGS
 from .scenes import load_scene
 from .sweep_bias import BiasSweep, sweep_bias
 
@@ -71,7 +72,7 @@ def fit(
     image_size: ImageSize = (512, 512),
     shadow_map_size: MapSize = 1024,
     cull_front: CullFront = False,
-    shading: ShadingName = "blinn-phong",
+    shading: ShadingWords = ("blinn-phong",),
 ) -> None:
     """Fit a shadow bias so that acne and leaks are least, and compare with a full sweep.
 
@@ -86,11 +87,12 @@ def fit(
     terms = CombinedBias(parse_techniques(Bias, bias, option="--bias"))
     free_numbers(terms, free or None)
     lookup = parse_technique(Filter, filter, option="--filter")
+    model = parse_shading(shading)
     goal = None if target is None else read_image(target)
     if goal is not None and target is not None:
         check_target(target, goal, image_size)
     with stage(f"loading {scene}"):
-        loaded = load_scene(scene)
+        loaded = prepare_scene(load_scene(scene))
         check_scene(loaded)
     say_notes(loaded.notes)
     with stage("rendering both passes and tracing the truth"):
@@ -99,7 +101,7 @@ def fit(
             image_size=image_size,
             map_size=shadow_map_size,
             filter=lookup,
-            shading=SHADINGS[shading],
+            shading=model,
             cull_front=cull_front,
         )
         if goal is not None and target is not None:
@@ -125,7 +127,7 @@ def fit(
     settings = {
         "scene": scene, "target": None if target is None else str(target), "bias": list(bias),
         "filter": filter, "image_size": list(image_size), "shadow_map_size": shadow_map_size,
-        "cull_front": cull_front, "shading": shading,
+        "cull_front": cull_front, "shading": list(shading),
     }  # fmt: skip
     summary = _summary(study, biases, errors, fitted, swept)
     _write_json(out / "summary.json", {"settings": settings, **summary, **_made_with()})
@@ -152,7 +154,8 @@ class _Pictures:
     def write_truth(self) -> None:
         """Write the image under ray-traced visibility, and the shadow map."""
         self._write_image("truth", self._study.truth.astype(np.float32))
-        write_exr(self._out / "shadow_map.exr", shadow_map_channels(self._study.unbiased))
+        shadow_maps = self._study.unbiased.shadow_maps
+        write_exr(self._out / "shadow_map.exr", shadow_map_channels(shadow_maps))
 
     def write_comparison(self, errors: Mapping[str, ShadowErrors]) -> None:
         """Write all of it on one page."""
@@ -171,7 +174,7 @@ class _Pictures:
     def _write_image(self, name: str, visibility: np.ndarray) -> np.ndarray:
         color = self._study.picture(visibility)
         picture = on_background(color, self._covered)
-        image = self._study.unbiased._replace(color=color, visibility=visibility)
+        image = self._study.unbiased._replace(color=color, visibilities=(visibility,))
         write_exr(self._out / f"{name}.exr", image_channels(image))
         write_png(self._out / f"{name}.png", picture)
         self._panels[name] = picture

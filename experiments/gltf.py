@@ -6,20 +6,26 @@ v downwards, so ``v = 1 - v_gltf``. Tangents need no change of sign: glTF's bita
 (specification 3.7.2.1, 3.9.3), and that is increasing v here: ``handedness = w``.
 """
 
+import functools
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from tangentspace.mesh import Mesh
 from tangentspace.shapes import merge, transform_mesh
+from tangentspace.texture import Texture
 
 from .framing import frame_mesh, framing_camera, key_light
 from .gltf_data import GltfData, Node, read_gltf, scene_nodes
 from .gltf_views import read_camera, read_lights
+from .map_files import color_map
 from .mesh_build import BuiltMesh, SceneFileError, build_mesh, reading
+from .normal_texels import LoadedMap, normal_map
 from .scene import Material, Scene
+from .texture_file import Pixels
 
 _STRIP, _FAN, _TRIANGLES = 5, 6, 4
 _UNUSED = {
@@ -40,6 +46,9 @@ class _Look(NamedTuple):
 
     material: Material
     uv_set: int
+
+
+_ReadTexture = Callable[[int, Callable[[Pixels, str], LoadedMap]], Texture | None]
 
 
 def load_gltf(path: Path) -> Scene:
@@ -82,6 +91,7 @@ def load_gltf(path: Path) -> Scene:
 def _build(data: GltfData, nodes: list[Node], notes: tuple[str, ...]) -> BuiltMesh:
     """Return all triangles of the scene as one mesh."""
     said = [*notes, *(text for kind, text in _UNUSED.items() if data.items(kind))]
+    read_texture = functools.cache(functools.partial(_texture, data, said))
     looks: dict[int | None, _Look] = {}
     parts: list[_Part] = []
     for node in nodes:
@@ -95,7 +105,7 @@ def _build(data: GltfData, nodes: list[Node], notes: tuple[str, ...]) -> BuiltMe
             else:
                 index = primitive.get("material")
                 if index not in looks:
-                    looks[index] = _look(data, index, said)
+                    looks[index] = _look(data, index, read_texture, said)
                 part = _part(data, primitive, looks[index], said)
                 with np.errstate(invalid="ignore", over="ignore"):
                     parts.append(_Part(transform_mesh(part, node.world_from_node), index))
@@ -172,7 +182,7 @@ def _with_equal_tangents(
     ]
 
 
-def _look(data: GltfData, index: int | None, said: list[str]) -> _Look:
+def _look(data: GltfData, index: int | None, read_texture: _ReadTexture, said: list[str]) -> _Look:
     """Return a material; where its textures use different UV sets, the normal map's stays."""
     if index is None:
         return _Look(Material(), 0)
@@ -185,25 +195,33 @@ def _look(data: GltfData, index: int | None, said: list[str]) -> _Look:
     if len(set(sets)) > 1:
         said.append("color textures on another UV set than their normal texture ignored")
         color = None
-    red, green, blue, _ = surface.get("baseColorFactor", [1, 1, 1, 1])
+    red, green, blue, _ = map(float, surface.get("baseColorFactor", [1, 1, 1, 1]))
+    scale = (normal or {}).get("scale", 1)
     return _Look(
         Material(
-            base_color=(float(red), float(green), float(blue)),
-            base_color_texture=_texture(data, color, said, color=True),
-            normal_texture=_texture(data, normal, said, color=False),
-            normal_scale=float((normal or {}).get("scale", 1)),
+            base_color=None if red == green == blue == 1 else (red, green, blue),
+            base_color_texture=read_texture(color["index"], color_map) if color else None,
+            normal_texture=read_texture(normal["index"], normal_map) if normal else None,
+            normal_scale=None if scale == 1 else float(scale),
         ),
         sets[0] if sets else 0,
     )
 
 
 def _texture(
-    data: GltfData, info: dict[str, Any] | None, said: list[str], *, color: bool
-) -> Float[np.ndarray, "height width 3"] | None:
-    """Return a texture's texels, or None where there is none that can be read."""
-    if info is None:
-        return None
-    texels = data.texture(info["index"], color=color)
-    if texels is None:
-        said.append("textures in formats of extensions ignored")
-    return texels
+    data: GltfData, said: list[str], index: int, check: Callable[[Pixels, str], LoadedMap]
+) -> Texture | None:
+    """Return a texture, or None where there is none that can be read."""
+    try:
+        pixels = data.pixels(index)
+        if pixels is None:
+            said.append("textures in formats of extensions ignored")
+            return None
+        texels, notes = check(pixels, f"texture {index}")
+    except SceneFileError:
+        raise
+    except ValueError as error:
+        raise SceneFileError(f"{data.path}: {error}") from error
+    said += notes
+    wrap_u, wrap_v = data.wraps(index)
+    return Texture(texels, wrap_u, wrap_v)

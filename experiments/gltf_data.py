@@ -16,12 +16,16 @@ from urllib.parse import unquote
 import numpy as np
 from jaxtyping import Float, Num
 
+from tangentspace.texture import Wrap, clamp, mirror, repeat
+
 from .mesh_build import SceneFileError
-from .texture_file import read_texture
+from .texture_file import Pixels, read_pixels
 
 _SUPPORTED = {"KHR_lights_punctual", "KHR_mesh_quantization"}
 _TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_REPEAT = 10497
+_WRAPS: dict[int, Wrap] = {_REPEAT: repeat, 33071: clamp, 33648: mirror}
 
 
 class GltfData(NamedTuple):
@@ -59,10 +63,12 @@ class GltfData(NamedTuple):
             return np.maximum(values.astype(np.float64) / np.iinfo(dtype).max, -1.0)
         return values
 
-    def texture(
-        self, texture_index: int, *, color: bool
-    ) -> Float[np.ndarray, "height width 3"] | None:
-        """Return a texture's texels as ``read_texture``; None if only an extension has them."""
+    def pixels(self, texture_index: int) -> Pixels | None:
+        """Return a texture's image as its file stores it; None if only an extension has it.
+
+        Raises:
+            ValueError: If it is no image.
+        """
         source = self.items("textures")[texture_index].get("source")
         if source is None:
             return None
@@ -71,7 +77,13 @@ class GltfData(NamedTuple):
             data = self._view(image["bufferView"])
         else:
             data = _fetch(self.path, image["uri"], "texture")
-        return read_texture(io.BytesIO(data), color=color)
+        return read_pixels(io.BytesIO(data), f"texture {texture_index}")
+
+    def wraps(self, texture_index: int) -> tuple[Wrap, Wrap]:
+        """Return how a texture goes on beyond its borders, along u and along v."""
+        index = self.items("textures")[texture_index].get("sampler")
+        sampler = {} if index is None else self.items("samplers")[index]
+        return _WRAPS[sampler.get("wrapS", _REPEAT)], _WRAPS[sampler.get("wrapT", _REPEAT)]
 
     def _rows(
         self, place: dict[str, Any], dtype: np.dtype, shape: tuple[int, int]

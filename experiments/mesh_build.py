@@ -5,6 +5,7 @@ has one index per corner. Nothing is merged that the file keeps apart, so UV sea
 and vertices keep the file's order. What is legal but odd is counted and said in the notes.
 """
 
+import dataclasses
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from tangentspace.mesh import Mesh
+from tangentspace.texture import clamp
 
 from .scene import Material
 from .smooth_normals import (
@@ -25,6 +27,7 @@ from .smooth_normals import (
 )
 
 PLAIN = Material(base_color=(0.7, 0.7, 0.7))
+_UV_ROUNDING = 1e-5  # a UV so far outside [0, 1] still counts as inside
 
 
 class SceneFileError(ValueError):
@@ -196,13 +199,44 @@ def build_mesh(
         handedness = np.where(given[:, 3:] < 0, -1.0, 1.0)
         tangents = np.concatenate([tangents, handedness], axis=1).astype(np.float32)
     mesh = Mesh(positions, normals.astype(np.float32), faces, uvs, tangents)
-    return BuiltMesh(mesh, face_materials.astype(np.int32), materials, notes)
+    materials, said = _usable_textures(mesh, face_materials, materials)
+    return BuiltMesh(mesh, face_materials.astype(np.int32), materials, notes + said)
 
 
 def counted(where: Bool[np.ndarray, " items"], one: str, many: str, what: str) -> tuple[str, ...]:
     """Return a note on how many items there are, or none if there are none."""
     count = int(where.sum())
     return (f"{count} {one if count == 1 else many} {what}",) if count else ()
+
+
+def _usable_textures(
+    mesh: Mesh, face_materials: Int[np.ndarray, " faces"], materials: tuple[Material, ...]
+) -> tuple[tuple[Material, ...], tuple[str, ...]]:
+    """Return materials, without textures where there are no UVs; count UVs that are clamped."""
+    textures = [
+        (index, kind, texture)
+        for index, material in enumerate(materials)
+        for kind in ("base_color_texture", "normal_texture", "height_texture")
+        if (texture := getattr(material, kind)) is not None
+    ]
+    if mesh.uvs is None:
+        plain = list(materials)
+        for index, kind, _ in textures:
+            plain[index] = dataclasses.replace(plain[index], **{kind: None})
+        without = np.isin(np.arange(len(plain)), [index for index, *_ in textures])
+        return tuple(plain), counted(
+            without, "material", "materials", "with textures but no UVs: used without"
+        )
+    uvs = np.asarray(mesh.uvs)
+    beyond = (uvs < -_UV_ROUNDING) | (uvs > 1 + _UV_ROUNDING)
+    clamped = np.zeros(len(uvs), bool)
+    for index, _, texture in textures:
+        corners = np.asarray(mesh.faces)[face_materials == index].ravel()
+        for axis, wrap in enumerate((texture.wrap_u, texture.wrap_v)):
+            if wrap is clamp:
+                clamped[corners] |= beyond[corners, axis]
+    what = "with UVs outside [0, 1] under a clamped texture: its border is seen there"
+    return materials, counted(clamped, "vertex", "vertices", what)
 
 
 def _flaws(

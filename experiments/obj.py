@@ -10,23 +10,25 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from .mesh_build import PLAIN, Polygons
-from .scene import Material
-from .texture_file import read_texture
+from .mesh_build import Polygons, SceneFileError
+from .mtl import MtlMaterial, load_materials, read_mtl
 
 _NO_SUCH = -2  # an index that the range check refuses; -1 means that a corner has no UV
 
 
 def read_obj(path: Path) -> Polygons:
-    """Read the polygons, and colors and color textures of the materials they use.
+    """Read the polygons and the materials they use.
 
     Lines, curves, smoothing groups and vertex colors are passed over; all objects and groups
     become one mesh. A missing material file or texture is noted, not an error.
+
+    Raises:
+        SceneFileError: If a material's numbers or images cannot be used.
     """
     pools: dict[str, list[list[str]]] = {"v": [], "vt": [], "vn": []}
-    sizes, corners, polygon_materials = [], [], []
-    library: dict[str, Material] = {}
-    names, name = [""], 0
+    sizes, corners, polygon_names = [], [], []
+    library: dict[str, MtlMaterial] = {}
+    names, name = {"": 0}, 0
     notes: list[str] = []
     for line in path.read_text("utf-8", "replace").replace("\\\n", " ").splitlines():
         key, *words = line.split() or [""]
@@ -36,22 +38,30 @@ def read_obj(path: Path) -> Polygons:
             counts = [len(pool) for pool in pools.values()]
             sizes.append(len(words))
             corners += [_corner(word, counts) for word in words]
-            polygon_materials.append(name)
+            polygon_names.append(name)
         elif key == "usemtl":
-            names.append(" ".join(words))
-            name = len(names) - 1
+            name = names.setdefault(" ".join(words), len(names))
         elif key == "mtllib":
-            library |= _read_mtl(path.parent / " ".join(words), notes)
-    used, polygon_names = np.unique(np.array(polygon_materials, np.int64), return_inverse=True)
+            file = path.parent / " ".join(words)
+            if file.is_file():
+                library |= read_mtl(file)
+            else:
+                notes.append(f"material file {file.name} not found: plain gray used")
+    used, polygon_materials = np.unique(np.array(polygon_names, np.int64), return_inverse=True)
+    sources = [library.get(tuple(names)[index]) for index in used]
+    try:
+        materials, said = load_materials(sources or [None])
+    except ValueError as error:
+        raise SceneFileError(f"{path}: {error}") from error
     return Polygons(
         positions=_numbers(pools["v"], 3),
         sizes=np.array(sizes, np.int64),
         corners=np.array(corners, np.int64).reshape(-1, 3),
         uvs=_numbers([[*words, "0"] for words in pools["vt"]], 2),
         normals=_numbers(pools["vn"], 3),
-        polygon_materials=polygon_names,
-        materials=tuple(library.get(names[index], PLAIN) for index in used) or (PLAIN,),
-        notes=tuple(notes),
+        polygon_materials=polygon_materials,
+        materials=materials,
+        notes=(*notes, *said),
     )
 
 
@@ -77,31 +87,3 @@ def _numbers(lines: list[list[str]], columns: int) -> Float[np.ndarray, "lines c
         if len(words) < columns:
             raise ValueError(f"expected {columns} numbers, got '{' '.join(words)}'")
     return np.array([words[:columns] for words in lines], np.float64).reshape(-1, columns)
-
-
-def _read_mtl(path: Path, notes: list[str]) -> dict[str, Material]:
-    """Return a library's materials (``Kd`` as linear RGB, ``map_Kd`` as sRGB); add to notes."""
-    if not path.is_file():
-        notes.append(f"material file {path.name} not found: plain gray used")
-        return {}
-    materials: dict[str, Material] = {}
-    name = ""
-    for line in path.read_text("utf-8", "replace").splitlines():
-        key, _, rest = line.strip().partition(" ")
-        rest = rest.strip()
-        if key == "newmtl":
-            name = rest
-            materials[name] = Material()
-        elif key == "Kd":
-            red, green, blue = (float(word) for word in rest.split()[:3])
-            materials[name] = materials[name]._replace(base_color=(red, green, blue))
-        elif key == "map_Kd":
-            # Options such as "-s 1 1 1" stand before the file's name.
-            file = rest.split()[-1] if rest.startswith("-") else rest
-            image = path.parent / file.replace("\\", "/")
-            if image.is_file():
-                texture = read_texture(image, color=True)
-                materials[name] = materials[name]._replace(base_color_texture=texture)
-            else:
-                notes.append(f"texture {image.name} not found: its material's color is used alone")
-    return materials

@@ -1,22 +1,28 @@
 """``python -m experiments render``: one image of a scene, with its shadow map."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 import tyro
+from jaxtyping import Array
 
 from shadows.bias import Bias, CombinedBias
 from shadows.compare import Compare
 from shadows.filters import Filter
 from shadows.render import Rendering
+from shadows.shadow_map import ShadowMap
+from tangentspace.shading import Shading
 
 from .checks import check_out, check_scene, check_shadow_map, check_size
 from .console import say, say_notes, stage
 from .figures import on_background
 from .images import Channels, write_exr, write_png
 from .options import describe, parse_technique, parse_techniques
-from .render_scene import SHADINGS, render_scene
+from .prepare_scene import prepare_scene
+from .render_scene import render_scene
+from .scene_maps import with_maps
 from .scenes import EMBEDDED, load_scene
 
 SceneName = Annotated[
@@ -46,8 +52,20 @@ FilterWord = Annotated[
 CullFront = Annotated[
     bool, tyro.conf.arg(help="Draw only faces turned away from the light into the shadow map.")
 ]
-ShadingName = Annotated[
-    Literal["blinn-phong", "phong", "lambert"], tyro.conf.arg(help="Lighting model of the picture.")
+MapFile = Annotated[
+    Path | None,
+    tyro.conf.arg(
+        metavar="IMAGE",
+        help="Map on the surface, .png or .exr, by its uvs.",
+        help_behavior_hint="(default: the scene's own)",
+    ),
+]
+ShadingWords = Annotated[
+    tuple[str, ...],
+    tyro.conf.arg(
+        metavar="NAME[.NUMBER=VALUE]",
+        help="Lighting model of the picture. " + "; ".join(describe(Shading)) + ".",
+    ),
 ]
 
 
@@ -68,12 +86,40 @@ def render(
     compare: CompareWord = "hard",
     filter: FilterWord = "bilinear",
     cull_front: CullFront = False,
-    shading: ShadingName = "blinn-phong",
+    shading: ShadingWords = ("blinn-phong",),
+    normal_map: MapFile = None,
+    flip_green: Annotated[
+        bool, tyro.conf.arg(help="The normal map's green points down (-Y, as DirectX has it).")
+    ] = False,
+    color_map: MapFile = None,
+    height_map: MapFile = None,
+    height_scale: Annotated[
+        float, tyro.conf.arg(metavar="LENGTH", help="World length that a height of 1 stands for.")
+    ] = 1.0,
+    environment: Annotated[
+        tuple[Path, ...],
+        tyro.conf.arg(
+            metavar="IMAGE",
+            help="Six images in the order +x -x +y -y +z -z, or a folder of them: the background, "
+            "and what reflective surfaces mirror.",
+        ),
+    ] = (),
+    reflectivity: Annotated[
+        float | None,
+        tyro.conf.arg(
+            metavar="SHARE",
+            help="Share of the mirrored environment in the surface's color, from 0 to 1.",
+            help_behavior_hint="(default: the scene's own)",
+        ),
+    ] = None,
 ) -> None:
-    """Render a scene under its first light with a shadow map.
+    """Render a scene under its lights, each with a shadow map.
+
+    Maps given here take the place of the scene's own, on all that it brought.
 
     An EXR holds linear color R G B, depth.Z (window depth in [0, 1]), normal.X Y Z (world
-    space) and visibility.V (1 = lit); the shadow map's file holds depth.Z in [0, 1].
+    space, with normal maps) and visibility.V (1 = lit; visibility2.V of a second light); the
+    shadow map's file holds depth.Z in [0, 1] (depth2.Z).
     """
     check_out(out, ".exr", ".png")
     for extra, suffix in ((png_out, ".png"), (shadow_map_out, ".exr")):
@@ -84,8 +130,25 @@ def render(
     terms = CombinedBias(parse_techniques(Bias, bias, option="--bias"))
     comparison = parse_technique(Compare, compare, option="--compare", least=0.0)
     lookup = parse_technique(Filter, filter, option="--filter")
+    model = parse_shading(shading)
+    if reflectivity is not None and not 0 <= reflectivity <= 1:
+        raise ValueError(f"--reflectivity: expected a share from 0 to 1, got {reflectivity}")
+    if not np.isfinite(height_scale):
+        raise ValueError(f"--height-scale: expected a finite length, got {height_scale}")
+    if flip_green and normal_map is None:
+        raise ValueError("--flip-green: is for --normal-map, which is not given; drop it")
     with stage(f"loading {scene}"):
-        loaded = load_scene(scene)
+        loaded = with_maps(
+            load_scene(scene),
+            color_map=color_map,
+            normal_map=normal_map,
+            flip_green=flip_green,
+            height_map=height_map,
+            height_scale=height_scale,
+            environment=environment,
+            reflectivity=reflectivity,
+        )
+        loaded = prepare_scene(loaded)
         check_scene(loaded)
     say_notes(loaded.notes)
     with stage("compiling and rendering"):
@@ -96,37 +159,58 @@ def render(
             bias=terms,
             filter=lookup,
             compare=comparison,
-            shading=SHADINGS[shading],
+            shading=model,
             cull_front=cull_front,
         )
-    check_shadow_map(loaded, image.shadow_map, cull_front=cull_front)
-    if not bool(image.surface.covered.any()):
+    for shadow_map in image.shadow_maps:
+        check_shadow_map(loaded, shadow_map, cull_front=cull_front)
+    covered = np.asarray(image.surface.covered)
+    if not covered.any():
         say_notes(["the camera sees no surface; the image is empty"])
     if out.suffix.lower() == ".exr":
         write_exr(out, image_channels(image))
     for path in (png_out, out if out.suffix.lower() == ".png" else None):
         if path is not None:
-            write_png(
-                path, on_background(np.asarray(image.color), np.asarray(image.surface.covered))
-            )
+            color = np.asarray(image.color)
+            write_png(path, color if loaded.environment else on_background(color, covered))
     if shadow_map_out is not None:
-        write_exr(shadow_map_out, shadow_map_channels(image))
+        write_exr(shadow_map_out, shadow_map_channels(image.shadow_maps))
     for path in (out, png_out, shadow_map_out):
         if path is not None:
             say(f"wrote {path}")
 
 
+def parse_shading(words: Sequence[str]) -> Shading:
+    """Make the lighting model that the words of ``--shading`` name.
+
+    Raises:
+        ValueError: If they name none, or several, or are not understood.
+    """
+    models = parse_techniques(Shading, words, option="--shading")
+    if len(models) != 1:
+        raise ValueError(f"--shading: expected one lighting model, got {len(models)}; name one")
+    return models[0]
+
+
 def image_channels(image: Rendering) -> Channels:
     """Return the channels of an image's EXR file."""
-    color, normal = np.asarray(image.color), np.asarray(image.surface.normal)
+    color, normal = np.asarray(image.color), np.asarray(image.appearance.normal)
     return {
         **{name: color[..., k] for k, name in enumerate("RGB")},
         "depth.Z": np.asarray(image.surface.depth),
         **{f"normal.{name}": normal[..., k] for k, name in enumerate("XYZ")},
-        "visibility.V": np.asarray(image.visibility),
+        **_numbered("visibility", "V", image.visibilities),
     }
 
 
-def shadow_map_channels(image: Rendering) -> Channels:
-    """Return the channel of a shadow map's EXR file."""
-    return {"depth.Z": np.asarray(image.shadow_map.depth)}
+def shadow_map_channels(shadow_maps: Sequence[ShadowMap]) -> Channels:
+    """Return the channels of a file with the shadow maps of all lights."""
+    return _numbered("depth", "Z", [shadow_map.depth for shadow_map in shadow_maps])
+
+
+def _numbered(layer: str, channel: str, images: Sequence[Array]) -> Channels:
+    """Return ``depth.Z`` for the first light, ``depth2.Z`` for the second, and so on."""
+    return {
+        f"{layer}{'' if k == 0 else k + 1}.{channel}": np.asarray(image)
+        for k, image in enumerate(images)
+    }

@@ -1,6 +1,6 @@
 """Render a ``Scene``: the one place where experiments compile ``shadows.render``."""
 
-import functools
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -8,21 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from shadows.appearance import Appearance
 from shadows.bias import Bias
 from shadows.compare import Compare
 from shadows.filters import Filter
-from shadows.interpolate import gather_faces
 from shadows.lights import Light
-from shadows.render import Rendering, Shading, Surface, render, shade
-from tangentspace.lighting import blinn_phong, lambert, phong
+from shadows.render import Rendering, render, shade
+from shadows.surface import Surface
+from tangentspace.environment import CubeMap
+from tangentspace.shading import Shading
 
-from .scene import Scene, face_colors
-
-SHADINGS: dict[str, Shading] = {
-    "blinn-phong": blinn_phong,
-    "phong": phong,
-    "lambert": functools.partial(lambert, albedo=0.8),
-}
+from .scene import Scene
 
 
 def render_scene(
@@ -36,39 +32,73 @@ def render_scene(
     shading: Shading,
     cull_front: bool = False,
 ) -> Rendering:
-    """Render a scene under its first light; compiled once per set of sizes and techniques."""
-    arrays = (scene.mesh, scene.camera, scene.lights[0], face_colors(scene), bias, compare)
-    static = (image_size, map_size, filter, shading, cull_front)
+    """Render a scene under all its lights; compiled once per set of sizes and techniques.
+
+    Args:
+        scene: As ``prepare_scene`` returns it.
+        image_size: Height and width in pixels.
+        map_size: Texels on each side of the shadow maps.
+        bias: Against self-shadowing.
+        filter: Which texels are asked.
+        compare: Hard or soft.
+        shading: The lighting model.
+        cull_front: Draw only faces turned away from the light into the maps.
+    """
+    look = (scene.materials, scene.face_materials, scene.environment)
+    arrays = (scene.mesh, scene.camera, scene.lights, look, bias, compare, shading)
+    static = (image_size, map_size, filter, cull_front)
     return jax.block_until_ready(_render(jax.tree.map(jnp.asarray, arrays), static))
 
 
 def shade_scene(
     scene: Scene,
-    surface: Surface,
-    light: Light,
-    visibility: Float[Array | np.ndarray, "height width"],
+    image: Rendering,
+    lights: Sequence[Light],
+    visibilities: Sequence[Float[Array | np.ndarray, "height width"]],
     shading: Shading,
 ) -> Float[Array, "height width 3"]:
-    """Light what is seen once more, with another visibility."""
-    colors = face_colors(scene)
-    base_color = None if colors is None else gather_faces(colors, surface.face_ids)
-    return shade(surface, light, jnp.asarray(visibility), base_color=base_color, shading=shading)
+    """Light what is seen once more, with other visibilities; the background is 0."""
+    visible = tuple(jnp.asarray(visibility) for visibility in visibilities)
+    arrays = (image.surface, tuple(lights), visible, image.appearance, scene.environment, shading)
+    return _shade(*jax.tree.map(jnp.asarray, arrays))
 
 
 @eqx.filter_jit
 def _render(arrays: tuple, static: tuple) -> Rendering:
-    mesh, camera, light, base_color, bias, compare = arrays
-    image_size, map_size, filter, shading, cull_front = static
+    mesh, camera, lights, look, bias, compare, shading = arrays
+    materials, face_materials, environment = look
+    image_size, map_size, filter, cull_front = static
     return render(
         mesh,
         camera,
-        light,
+        lights,
         image_size=image_size,
         map_size=map_size,
         cull_front=cull_front,
         bias=bias,
         filter=filter,
         compare=compare,
-        base_color=base_color,
+        materials=materials,
+        face_materials=face_materials,
+        environment=environment,
+        shading=shading,
+    )
+
+
+@eqx.filter_jit
+def _shade(
+    surface: Surface,
+    lights: tuple[Light, ...],
+    visibilities: tuple[Float[Array, "height width"], ...],
+    appearance: Appearance,
+    environment: CubeMap | None,
+    shading: Shading,
+) -> Float[Array, "height width 3"]:
+    return shade(
+        surface,
+        lights,
+        visibilities,
+        appearance=appearance,
+        environment=environment,
         shading=shading,
     )

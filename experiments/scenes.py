@@ -1,7 +1,7 @@
 """Scenes made by code, each for a failure it shows; ``load_scene`` finds them by name.
 
 World units are arbitrary; each scene is a few units wide. Elevations are angles of the
-light over the floor. A new scene is a new function in ``EMBEDDED``.
+light over the floor. A new scene is a new function in one of the tables below.
 """
 
 from collections.abc import Callable
@@ -9,70 +9,69 @@ from pathlib import Path
 
 import numpy as np
 
-from shadows.lights import DirectionalLight, Light, SpotLight
-from shadows.transforms import PerspectiveCamera, look_at
-from tangentspace.mesh import Mesh
-from tangentspace.shapes import box, icosphere, merge, plane, transform_mesh
+from shadows.lights import SpotLight
+from tangentspace.shapes import box, icosphere, plane
 
+from .mapped_scenes import bumpy, displaced, mirror, normal_cells
 from .mesh_file import load_scene_file
 from .options import hint
-from .scene import Material, Scene
-
-_UP = np.array([0.0, 1.0, 0.0], np.float32)
+from .relief import relief, shadowed_relief
+from .scene import Scene
+from .staging import placed, staged, sun
 
 
 def grazing_plane() -> Scene:
     """A bare floor under light 8 degrees high: nothing but acne can go wrong."""
     floor = plane(2.0)
-    return _scene("grazing-plane", [floor], eye=(0.0, 2.2, 3.4), light=_sun(8.0, 30.0))
+    return staged("grazing-plane", [floor], eye=(0.0, 2.2, 3.4), light=sun(8.0, 30.0))
 
 
 def thin_box() -> Scene:
     """A thin wall and a thin plate on a floor: a bias larger than they are loses shadow."""
-    wall = _placed(box((0.8, 0.4, 0.01)), (0.0, 0.4, -0.3))
-    plate = _placed(box((0.35, 0.02, 0.35)), (-0.2, 0.02, 0.75))
-    return _scene(
-        "thin-box", [plane(2.0), wall, plate], eye=(1.6, 2.2, 3.0), light=_sun(40.0, 160.0)
+    wall = placed(box((0.8, 0.4, 0.01)), (0.0, 0.4, -0.3))
+    plate = placed(box((0.35, 0.02, 0.35)), (-0.2, 0.02, 0.75))
+    return staged(
+        "thin-box", [plane(2.0), wall, plate], eye=(1.6, 2.2, 3.0), light=sun(40.0, 160.0)
     )
 
 
 def sphere() -> Scene:
     """A ball that hovers over a floor: every slope towards the light at once."""
-    ball = _placed(icosphere(0.6, subdivisions=5), (0.0, 0.8, 0.0))
-    return _scene("sphere", [plane(2.0), ball], eye=(1.4, 1.9, 3.2), light=_sun(50.0, -60.0))
+    ball = placed(icosphere(0.6, subdivisions=5), (0.0, 0.8, 0.0))
+    return staged("sphere", [plane(2.0), ball], eye=(1.4, 1.9, 3.2), light=sun(50.0, -60.0))
 
 
 def stacked() -> Scene:
     """Two plates one above the other over a floor: three depths behind one texel."""
-    low = _placed(box((0.6, 0.02, 0.4)), (0.0, 0.3, 0.0))
-    high = _placed(box((0.35, 0.02, 0.6)), (0.15, 0.8, 0.1))
-    return _scene("stacked", [plane(2.0), low, high], eye=(1.5, 2.0, 3.2), light=_sun(55.0, 200.0))
+    low = placed(box((0.6, 0.02, 0.4)), (0.0, 0.3, 0.0))
+    high = placed(box((0.35, 0.02, 0.6)), (0.15, 0.8, 0.1))
+    return staged("stacked", [plane(2.0), low, high], eye=(1.5, 2.0, 3.2), light=sun(55.0, 200.0))
 
 
 def spot() -> Scene:
     """A wall and a ball in the cone of a spotlight: texels grow with distance."""
-    ball = _placed(icosphere(0.4, subdivisions=4), (0.5, 0.4, 0.3))
-    wall = _placed(box((0.03, 0.5, 0.5)), (-0.5, 0.5, 0.0))
+    ball = placed(icosphere(0.4, subdivisions=4), (0.5, 0.4, 0.3))
+    wall = placed(box((0.03, 0.5, 0.5)), (-0.5, 0.5, 0.0))
     position = np.array([-1.8, 2.6, 1.6], np.float32)
     direction = -position / np.linalg.norm(position)
     light = SpotLight(position, direction.astype(np.float32), inner_angle=0.45, outer_angle=0.6)
-    return _scene("spot", [plane(2.5), ball, wall], eye=(1.8, 2.2, 3.0), light=light)
+    return staged("spot", [plane(2.5), ball, wall], eye=(1.8, 2.2, 3.0), light=light)
 
 
 def default() -> Scene:
     """Low light over a ball, a wall and sheets hardly thicker than the bias that acne asks for."""
-    ball = _placed(icosphere(0.45, subdivisions=4), (-0.75, 0.45, -0.35))
-    wall = _placed(box((0.01, 0.3, 0.45)), (0.55, 0.3, -0.2))
+    ball = placed(icosphere(0.45, subdivisions=4), (-0.75, 0.45, -0.35))
+    wall = placed(box((0.01, 0.3, 0.45)), (0.55, 0.3, -0.2))
     sheets = [
-        _placed(box((0.22, height, 0.22)), (x, height, 0.95))
+        placed(box((0.22, height, 0.22)), (x, height, 0.95))
         for x, height in ((-0.9, 0.002), (-0.2, 0.004), (0.5, 0.008))
     ]
-    return _scene(
-        "default", [plane(2.0), ball, wall, *sheets], eye=(0.5, 2.1, 3.3), light=_sun(16.0, -62.0)
+    return staged(
+        "default", [plane(2.0), ball, wall, *sheets], eye=(0.5, 2.1, 3.3), light=sun(16.0, -62.0)
     )
 
 
-EMBEDDED: dict[str, Callable[[], Scene]] = {
+SHADOW_SCENES: dict[str, Callable[[], Scene]] = {
     "default": default,
     "grazing-plane": grazing_plane,
     "thin-box": thin_box,
@@ -80,6 +79,15 @@ EMBEDDED: dict[str, Callable[[], Scene]] = {
     "stacked": stacked,
     "spot": spot,
 }
+MAPPED_SCENES: dict[str, Callable[[], Scene]] = {
+    "bumpy": bumpy,
+    "normal-cells": normal_cells,
+    "mirror": mirror,
+    "displaced": displaced,
+    "relief": relief,
+    "shadowed-relief": shadowed_relief,
+}
+EMBEDDED = SHADOW_SCENES | MAPPED_SCENES
 
 
 def load_scene(name: str) -> Scene:
@@ -95,27 +103,3 @@ def load_scene(name: str) -> Scene:
             f"scene '{name}': neither a file nor an embedded scene; {hint(name, EMBEDDED)}"
         )
     return load_scene_file(name)
-
-
-def _placed(mesh: Mesh, offset: tuple[float, float, float]) -> Mesh:
-    matrix = np.eye(4)
-    matrix[:3, 3] = offset
-    return transform_mesh(mesh, matrix)
-
-
-def _sun(elevation: float, azimuth: float) -> DirectionalLight:
-    """Return light from an elevation over the floor and an azimuth from +z to +x, degrees."""
-    up, turn = np.deg2rad([elevation, azimuth])
-    direction = [np.cos(up) * np.sin(turn), np.sin(up), np.cos(up) * np.cos(turn)]
-    return DirectionalLight(np.array(direction, np.float32))
-
-
-def _scene(name: str, parts: list[Mesh], *, eye: tuple[float, float, float], light: Light) -> Scene:
-    """Merge the parts and look at a point a little over the floor's middle."""
-    mesh = merge(*parts)
-    view_from_world = look_at(np.array(eye), np.array([0.0, 0.3, 0.0]), _UP)
-    camera = PerspectiveCamera(
-        np.asarray(view_from_world, np.float32), float(np.deg2rad(40.0)), 0.5, 20.0
-    )
-    materials = np.zeros(len(mesh.faces), np.int32)
-    return Scene(name, mesh, materials, (Material(),), camera, (light,))

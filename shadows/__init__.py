@@ -1,5 +1,7 @@
 """Visibility: rasterized shadow maps with soft comparison, differentiable in JAX."""
 
+from .appearance import Appearance as Appearance
+from .appearance import surface_appearance as surface_appearance
 from .bias import Bias as Bias
 from .bias import CombinedBias as CombinedBias
 from .bias import ConstantBias as ConstantBias
@@ -14,6 +16,7 @@ from .filters import NearestFilter as NearestFilter
 from .filters import Tap as Tap
 from .filters import compare_taps as compare_taps
 from .filters import look_up as look_up
+from .interpolate import barycentric_slopes as barycentric_slopes
 from .interpolate import barycentrics as barycentrics
 from .interpolate import gather_faces as gather_faces
 from .interpolate import interpolate as interpolate
@@ -25,16 +28,16 @@ from .lights import SpotLight as SpotLight
 from .rasterize import Raster as Raster
 from .rasterize import rasterize as rasterize
 from .render import Rendering as Rendering
-from .render import Surface as Surface
 from .render import receive_surface as receive_surface
 from .render import render as render
-from .render import render_surface as render_surface
 from .render import shade as shade
 from .render import surface_visibility as surface_visibility
 from .shadow_map import Receiver as Receiver
 from .shadow_map import ShadowMap as ShadowMap
 from .shadow_map import receive as receive
 from .shadow_map import render_shadow_map as render_shadow_map
+from .surface import Surface as Surface
+from .surface import render_surface as render_surface
 from .transforms import Camera as Camera
 from .transforms import OrthographicCamera as OrthographicCamera
 from .transforms import PerspectiveCamera as PerspectiveCamera

@@ -52,29 +52,44 @@ def barycentrics(
         Smooth in ``clip_positions`` inside a face; zero where no face is, and at the
         weights of a face of zero area.
     """
-    height, width = face_ids.shape
-    x, y = pixel_centers(height, width, clip_positions.dtype)
-    covered = face_ids >= 0
-    columns = jnp.asarray(clip_positions).T
-    rays = []
-    for corner in _face_corners(faces, face_ids):
-        # Guarded: where no face is, whatever face 0 holds must not reach a derivative.
-        vertex_x, vertex_y, w = (
-            jnp.where(covered, columns[axis].at[corner].get(mode="clip"), 1) for axis in (0, 1, 3)
-        )
-        rays.append((vertex_x - x * w, vertex_y - y[:, None] * w))
-    areas = [rays[i][0] * rays[j][1] - rays[i][1] * rays[j][0] for i, j in ((1, 2), (2, 0), (0, 1))]
-    facing = jnp.where(areas[0] + areas[1] + areas[2] < 0, -1, 1).astype(x.dtype)
-    # Fused products leave a rounding error where the area is 0.
-    areas = [area * facing for area in areas]
-    reach = sum(jnp.abs(ray_x) + jnp.abs(ray_y) for ray_x, ray_y in rays)
-    flat = areas[0] + areas[1] + areas[2] <= jnp.finfo(x.dtype).eps * reach**2
+    areas, _, reach = _edge_functions(clip_positions, faces, face_ids)
+    flat = areas[0] + areas[1] + areas[2] <= jnp.finfo(reach.dtype).eps * reach**2
     # Rounding may put a centre outside its face: no weight is negative, but the derivative
     # stays that of the plane.
     areas = [area + lax.stop_gradient(jnp.maximum(-area, 0)) for area in areas]
     total = jnp.where(flat, 0, areas[0] + areas[1] + areas[2])
     weights = [jnp.where(flat, 1 / 3, safe_divide(area, total)) for area in areas]
-    return jnp.where(covered[..., None], stack3(*weights), 0.0)
+    return jnp.where(face_ids[..., None] >= 0, stack3(*weights), 0.0)
+
+
+def barycentric_slopes(
+    clip_positions: ClipPositions, faces: Faces, face_ids: FaceIds
+) -> tuple[Float[Array, "height width 3"], Float[Array, "height width 3"]]:
+    """Return how the weights of ``barycentrics`` change from pixel to pixel.
+
+    Blended by these, an attribute's change is its derivative in the image: texture lookups
+    take their footprint from it.
+
+    Returns:
+        The change per pixel to the right, and per pixel downwards, along the plane of the
+        face; 0 where no face is and for faces of zero area.
+
+    Differentiability:
+        As ``barycentrics``.
+    """
+    areas, slopes, reach = _edge_functions(clip_positions, faces, face_ids)
+    total = areas[0] + areas[1] + areas[2]
+    total = jnp.where(total <= jnp.finfo(reach.dtype).eps * reach**2, 0, total)
+    height, width = face_ids.shape
+    changes = []
+    for slope, step in zip(slopes, (2 / width, -2 / height), strict=True):
+        sum_of_slopes = slope[0] + slope[1] + slope[2]
+        change = [
+            step * safe_divide(slope[k] - safe_divide(areas[k], total) * sum_of_slopes, total)
+            for k in range(3)
+        ]
+        changes.append(jnp.where(face_ids[..., None] >= 0, stack3(*change), 0.0))
+    return changes[0], changes[1]
 
 
 def interpolate(
@@ -123,3 +138,34 @@ def _face_corners(faces: Faces, face_ids: FaceIds) -> list[Int[Array, "height wi
     index = jnp.maximum(face_ids, 0)
     columns = jnp.asarray(faces).T
     return [columns[k].at[index].get(mode="clip") for k in range(3)]
+
+
+def _edge_functions(
+    clip_positions: ClipPositions, faces: Faces, face_ids: FaceIds
+) -> tuple[list[Array], tuple[list[Array], list[Array]], Array]:
+    """Return what the weights are shares of, its slopes in NDC x and y, and the rays' size.
+
+    All are turned so that a face seen from behind has positive areas too.
+    """
+    height, width = face_ids.shape
+    x, y = pixel_centers(height, width, clip_positions.dtype)
+    covered = face_ids >= 0
+    columns = jnp.asarray(clip_positions).T
+    rays = []
+    for corner in _face_corners(faces, face_ids):
+        # Guarded: where no face is, whatever face 0 holds must not reach a derivative.
+        vertex_x, vertex_y, w = (
+            jnp.where(covered, columns[axis].at[corner].get(mode="clip"), 1) for axis in (0, 1, 3)
+        )
+        rays.append((vertex_x - x * w, vertex_y - y[:, None] * w, w))
+    pairs = [(rays[i], rays[j]) for i, j in ((1, 2), (2, 0), (0, 1))]
+    areas = [a[0] * b[1] - a[1] * b[0] for a, b in pairs]
+    facing = jnp.where(areas[0] + areas[1] + areas[2] < 0, -1, 1).astype(x.dtype)
+    # Fused products leave a rounding error where the area is 0.
+    areas = [area * facing for area in areas]
+    slopes_x = [(b[2] * a[1] - a[2] * b[1]) * facing for a, b in pairs]
+    slopes_y = [(a[2] * b[0] - b[2] * a[0]) * facing for a, b in pairs]
+    reach = jnp.zeros_like(facing)
+    for ray_x, ray_y, _ in rays:
+        reach = reach + jnp.abs(ray_x) + jnp.abs(ray_y)
+    return areas, (slopes_x, slopes_y), reach

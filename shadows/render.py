@@ -1,103 +1,52 @@
-"""The two-pass image: a light's shadow map, the eye's view, and the light between them.
+"""The two-pass image: shadow maps of the lights, the eye's view, and the light between them.
 
 Each stage is a function of plain arrays that can be used alone; ``render`` composes them.
-What depends on the eye (``Surface``) and what depends on the light (``ShadowMap``) are kept
-apart, so a fit or an animation computes again only what changed.
+What depends on the eye (``Surface``, ``Appearance``) and what depends on a light
+(``ShadowMap``) are kept apart, so a fit or an animation computes again only what changed.
 """
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
-from tangentspace._math import dot, safe_normalize
-from tangentspace.lighting import blinn_phong
+from tangentspace._math import dot
+from tangentspace.environment import CubeMap, reflect_environment, skybox
+from tangentspace.lighting import IncomingLight, shade_lights
+from tangentspace.material import Material
 from tangentspace.mesh import Mesh
-from tangentspace.vertex_normals import face_normals
+from tangentspace.shading import BlinnPhongShading, Shading
 
+from .appearance import Appearance, surface_appearance
 from .bias import Bias, SlopeBias
 from .compare import Compare, HardCompare
 from .filters import BilinearFilter, Filter, look_up
-from .interpolate import barycentrics, gather_faces, interpolate
 from .lights import Light
-from .rasterize import rasterize
 from .shadow_map import Receiver, ShadowMap, receive, render_shadow_map
-from .transforms import Camera, texel_from_clip, transform_points
+from .surface import Surface, render_surface
+from .transforms import Camera, texel_from_clip
 
-Shading = Callable[..., Float[Array, "... 3"]]
-
-
-class Surface(NamedTuple):
-    """What the eye sees at each pixel, before any light.
-
-    Attributes:
-        face_ids: The face, -1 where there is none.
-        depth: Window depth in [0, 1], 1 where there is none.
-        position: World space.
-        face_normal: Unit normal of the face, turned to the camera's side.
-        normal: Unit shading normal, interpolated, turned with the face's.
-        to_camera: Unit vector towards the eye.
-    """
-
-    face_ids: Int[Array, "height width"]
-    depth: Float[Array, "height width"]
-    position: Float[Array, "height width 3"]
-    face_normal: Float[Array, "height width 3"]
-    normal: Float[Array, "height width 3"]
-    to_camera: Float[Array, "height width 3"]
-
-    @property
-    def covered(self) -> Bool[Array, "height width"]:
-        """Whether there is a surface at the pixel."""
-        return self.face_ids >= 0
+Visibility = Float[Array, "height width"]
 
 
 class Rendering(NamedTuple):
     """An image and what it was made from.
 
     Attributes:
-        color: Linear RGB; the background is 0.
-        visibility: Of the light, in [0, 1]; 0 on faces turned away and on the background.
+        color: Linear RGB; the background is the environment, or 0.
+        visibilities: Of each light, in [0, 1]; 0 on faces turned away and on the background.
         surface: What the eye saw.
-        shadow_map: What the light saw.
+        appearance: How it looks before any light.
+        shadow_maps: What each light saw.
     """
 
     color: Float[Array, "height width 3"]
-    visibility: Float[Array, "height width"]
+    visibilities: tuple[Visibility, ...]
     surface: Surface
-    shadow_map: ShadowMap
-
-
-def render_surface(mesh: Mesh, camera: Camera, *, image_size: tuple[int, int]) -> Surface:
-    """Rasterize the mesh from the eye and interpolate what shading needs.
-
-    Args:
-        mesh: World space.
-        camera: The view; its aspect ratio follows the image's.
-        image_size: Height and width in pixels.
-
-    Differentiability:
-        Smooth in positions, normals and the camera inside each face; see ``rasterize``.
-    """
-    positions, faces = jnp.asarray(mesh.positions), jnp.asarray(mesh.faces)
-    clip = transform_points(camera.clip_from_world(image_size[1] / image_size[0]), positions)
-    raster = rasterize(clip, faces, image_size=image_size)
-    weights = barycentrics(clip, faces, raster.face_ids)
-    position = interpolate(positions, faces, raster.face_ids, weights)
-    normal = safe_normalize(interpolate(mesh.normals, faces, raster.face_ids, weights))
-    face_normal = gather_faces(face_normals(positions, faces), raster.face_ids)
-    to_camera = camera.to_camera(position)
-    away = (dot(face_normal, to_camera) < 0)[..., None]
-    return Surface(
-        raster.face_ids,
-        raster.depth,
-        position,
-        jnp.where(away, -face_normal, face_normal),
-        jnp.where(away, -normal, normal),
-        to_camera,
-    )
+    appearance: Appearance
+    shadow_maps: tuple[ShadowMap, ...]
 
 
 def receive_surface(surface: Surface, light: Light, shadow_map: ShadowMap) -> Receiver:
@@ -127,36 +76,52 @@ def surface_visibility(
 
 def shade(
     surface: Surface,
-    light: Light,
-    visibility: Float[Array, "height width"],
+    lights: Sequence[Light],
+    visibilities: Sequence[Visibility],
     *,
-    base_color: Float[Array | np.ndarray, "#height #width 3"] | None = None,
-    shading: Shading = blinn_phong,
+    appearance: Appearance | None = None,
+    environment: CubeMap | None = None,
+    shading: Shading = BlinnPhongShading(),
 ) -> Float[Array, "height width 3"]:
-    """Light each pixel; the background is 0.
+    """Light each pixel.
 
     Args:
         surface: What the eye sees.
-        light: Where light comes from and how much arrives unblocked.
-        visibility: Share that is not blocked; scales diffuse and specular, ambient stays.
-        base_color: Factor on the color, linear RGB, per pixel; None for none.
-        shading: A function of ``tangentspace.lighting``, or one with its signature.
+        lights: Where light comes from and how much arrives unblocked; at least one.
+        visibilities: For each light, the share that is not blocked; scales diffuse and
+            specular, ambient stays and counts once.
+        appearance: Color, normals with normal maps, and so on; None for plain white.
+        environment: What reflective materials mirror; None for black.
+        shading: The lighting model.
+
+    Returns:
+        Linear RGB; the background is 0.
+
+    Raises:
+        ValueError: If there is no light, or not one visibility for each.
     """
-    color = shading(
-        surface.normal,
-        light.to_light(surface.position),
-        surface.to_camera,
-        radiance=light.radiance(surface.position),
-        visibility=visibility,
-    )
-    color = color if base_color is None else color * base_color
+    if len(lights) != len(visibilities):
+        expected = f"expected one of `visibilities` for each of {len(lights)} lights"
+        raise ValueError(f"shade: {expected}, got {len(visibilities)}")
+    look = Appearance(surface.normal) if appearance is None else appearance
+    incoming = [
+        IncomingLight(light.to_light(surface.position), light.radiance(surface.position), visible)
+        for light, visible in zip(lights, visibilities, strict=True)
+    ]
+    color = shade_lights(look.bind(shading), look.normal, surface.to_camera, incoming)
+    if look.reflectivity is not None:
+        share = look.reflectivity[..., None]
+        mirrored = 0.0
+        if environment is not None:
+            mirrored = reflect_environment(environment, look.normal, surface.to_camera)
+        color = (1 - share) * color + share * mirrored
     return jnp.where(surface.covered[..., None], color, 0.0)
 
 
 def render(
     mesh: Mesh,
     camera: Camera,
-    light: Light,
+    lights: Light | Sequence[Light],
     *,
     image_size: tuple[int, int] = (512, 512),
     map_size: int = 1024,
@@ -164,39 +129,72 @@ def render(
     bias: Bias = SlopeBias(2.0),
     filter: Filter = BilinearFilter(),
     compare: Compare = HardCompare(),
-    base_color: Float[Array | np.ndarray, "faces 3"] | None = None,
-    shading: Shading = blinn_phong,
-    shadow_map: ShadowMap | None = None,
+    materials: Sequence[Material] = (),
+    face_materials: Int[Array | np.ndarray, " faces"] | None = None,
+    environment: CubeMap | None = None,
+    shading: Shading = BlinnPhongShading(),
+    shadow_maps: Sequence[ShadowMap] | None = None,
 ) -> Rendering:
-    """Render a mesh under one light with a shadow map.
+    """Render a mesh under its lights, with a shadow map for each.
 
     Args:
-        mesh: World space.
+        mesh: World space; with uvs where a material has textures, and with tangents where
+            one has a normal map (``tangentspace.with_tangents``).
         camera: The view.
-        light: The light.
+        lights: One light or several.
         image_size: Height and width in pixels.
-        map_size: Texels on each side of the shadow map.
-        cull_front: Draw only faces turned away from the light into the map.
+        map_size: Texels on each side of a shadow map.
+        cull_front: Draw only faces turned away from the light into the maps.
         bias: Against self-shadowing; the default is the least that clears every plane of
             acne under 2x2 lookup.
         filter: Which texels are asked.
         compare: Hard, or soft where derivatives are wanted.
-        base_color: Linear RGB of each face; None for white.
-        shading: A function of ``tangentspace.lighting``, or one with its signature.
-        shadow_map: A map kept from before, while only the eye or a bias moved.
+        materials: How the mesh looks; none is plain white. Height textures are not applied
+            here: ``tangentspace.displace`` moves the vertices before.
+        face_materials: For each face, the index of its material; not needed for one.
+        environment: What reflective materials mirror and the background shows; None for
+            black.
+        shading: The lighting model.
+        shadow_maps: Maps kept from before, while only the eye or a bias moved.
+
+    Raises:
+        ValueError: If there is no light, not one kept map for each light, or the mesh lacks
+            what its materials need.
 
     Differentiability:
         In everything but the discrete choices of which face is seen; see each stage.
     """
-    if shadow_map is None:
-        clip_from_world = light.clip_from_world(mesh.positions)
-        shadow_map = render_shadow_map(
-            mesh.positions, mesh.faces, clip_from_world, map_size=map_size, cull_front=cull_front
-        )
+    lights = (lights,) if isinstance(lights, Light) else tuple(lights)
+    if shadow_maps is None:
+        shadow_maps = [
+            render_shadow_map(
+                mesh.positions,
+                mesh.faces,
+                light.clip_from_world(mesh.positions),
+                map_size=map_size,
+                cull_front=cull_front,
+            )
+            for light in lights
+        ]
+    elif len(shadow_maps) != len(lights):
+        expected = f"expected one of `shadow_maps` for each of {len(lights)} lights"
+        raise ValueError(f"render: {expected}, got {len(shadow_maps)}")
     surface = render_surface(mesh, camera, image_size=image_size)
-    visibility = surface_visibility(
-        surface, light, shadow_map, bias=bias, filter=filter, compare=compare
+    visibilities = tuple(
+        surface_visibility(surface, light, shadow_map, bias=bias, filter=filter, compare=compare)
+        for light, shadow_map in zip(lights, shadow_maps, strict=True)
     )
-    pixel_color = None if base_color is None else gather_faces(base_color, surface.face_ids)
-    color = shade(surface, light, visibility, base_color=pixel_color, shading=shading)
-    return Rendering(color, visibility, surface, shadow_map)
+    appearance = surface_appearance(mesh, camera, surface, materials, face_materials=face_materials)
+    color = shade(
+        surface,
+        lights,
+        visibilities,
+        appearance=appearance,
+        environment=environment,
+        shading=shading,
+    )
+    if environment is not None:
+        height, width = image_size
+        sky = skybox(environment, camera.clip_from_world(width / height), height, width)
+        color = jnp.where(surface.covered[..., None], color, sky)
+    return Rendering(color, visibilities, surface, appearance, tuple(shadow_maps))

@@ -7,11 +7,11 @@ import jax
 import numpy as np
 
 from experiments.bias_study import Study, Trial, prepare_study
-from experiments.render_scene import SHADINGS
 from experiments.scene import Scene
 from experiments.scenes import load_scene
 from shadows.bias import CombinedBias, ConstantBias, SlopeBias
 from shadows.filters import BilinearFilter
+from tangentspace.shading import BlinnPhongShading
 
 IMAGE_SIZE, MAP_SIZE = (128, 128), 256
 BOTH = CombinedBias((ConstantBias(), SlopeBias()))
@@ -32,7 +32,7 @@ def study_of(scene: Scene) -> Study:
             image_size=IMAGE_SIZE,
             map_size=MAP_SIZE,
             filter=BilinearFilter(),
-            shading=SHADINGS["blinn-phong"],
+            shading=BlinnPhongShading(),
         )
 
 

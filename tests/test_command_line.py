@@ -21,9 +21,11 @@ from experiments.__main__ import main
 from experiments.console import say_table, stage
 from experiments.images import read_exr, read_image, write_exr, write_png
 from experiments.scenes import EMBEDDED
+from shadows.appearance import Appearance
 from shadows.bias import CombinedBias, ConstantBias, SlopeBias
-from shadows.render import Rendering, Surface
+from shadows.render import Rendering
 from shadows.shadow_map import ShadowMap
+from shadows.surface import Surface
 
 from .gltf_files import Builder
 from .studies import IMAGE_SIZE, MAP_SIZE, study
@@ -275,9 +277,10 @@ def seen(monkeypatch):
     def seen(depth):
         with jax.enable_x64(False):
             empty, none = jnp.zeros((64, 48, 3)), jnp.full((64, 48), -1)
-            surface = Surface(none, jnp.ones((64, 48)), empty, empty, empty, empty)
+            surface = Surface(none, jnp.ones((64, 48)), *[empty] * 5)
             shadow_map = ShadowMap(jnp.full((64, 64), depth), jnp.eye(4))
-            image = Rendering(empty, jnp.zeros((64, 48)), surface, shadow_map)
+            dark = (jnp.zeros((64, 48)),)
+            image = Rendering(empty, dark, surface, Appearance(empty), (shadow_map,))
         monkeypatch.setattr(experiments.render_command, "render_scene", lambda *_, **__: image)
 
     return seen

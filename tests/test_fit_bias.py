@@ -14,7 +14,7 @@ from experiments.fit_bias import fit_bias
 from experiments.images import read_image, write_exr, write_png
 from experiments.metrics import shadow_errors
 from experiments.scene import Material, Scene
-from experiments.scenes import EMBEDDED
+from experiments.scenes import SHADOW_SCENES
 from experiments.sweep_bias import sweep_bias
 from shadows.bias import CombinedBias, ConstantBias, NormalOffsetBias, SlopeBias
 from shadows.compare import HardCompare
@@ -66,7 +66,7 @@ def flat_scene(*heights, light=(0.0, 1.0, 0.0)):
 # Known answers
 
 
-@pytest.mark.parametrize("name", EMBEDDED)
+@pytest.mark.parametrize("name", SHADOW_SCENES)
 def test_a_fit_is_as_good_as_the_best_of_the_sweep_at_a_fraction_of_its_cost(name):
     trial, fit, sweep = outcome(name)
     assert hard_error(trial, CombinedBias()) > 0.3

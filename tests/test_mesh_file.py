@@ -13,6 +13,7 @@ from experiments.smooth_normals import smooth_normals
 from tangentspace.shapes import icosphere, torus
 from tangentspace.vertex_normals import vertex_normals
 
+from .test_mtl import texels_of
 from .tools import assert_close
 
 FLOOR_VERTICES, FLOOR_FACES = 4, 2
@@ -212,14 +213,12 @@ def test_obj_materials_color_their_faces(tmp_path):
     (tmp_path / "all.mtl").write_text(
         "newmtl unused\nKd 1 1 1\nnewmtl red\nKd 1 0 0\nnewmtl skin\nmap_Kd skin one.png\n"
     )
-    text = "mtllib all.mtl\n" + TRIANGLE + "usemtl skin\nf 1 2 3\nusemtl red\nf 1 3 2\nf 2 1 3\n"
-    scene = load(tmp_path, text)
+    faces = "usemtl skin\nf 1/1 2/1 3/1\nusemtl red\nf 1 3 2\nf 2 1 3\n"
+    scene = load(tmp_path, "mtllib all.mtl\nvt 0 0\n" + TRIANGLE + faces)
     np.testing.assert_array_equal(scene.face_materials, [0, 1, 1, 2, 2])
     assert scene.materials[1].base_color == (1, 0, 0)
     # sRGB 188 is the level nearest to half the light: ((188/255 + 0.055) / 1.055)^2.4.
-    texture = scene.materials[0].base_color_texture
-    assert texture is not None
-    assert_close(texture[0, 0], [1, 0.50288653, 0])
+    assert_close(texels_of(scene.materials[0].base_color_texture)[0, 0], [1, 0.50288653, 0])
 
 
 def test_missing_obj_material_or_texture_is_noted(tmp_path):

@@ -139,7 +139,7 @@ def test_background(sun_image):
     empty = np.asarray(sun_image.surface.face_ids) == -1
     assert 0.1 < empty.mean() < 0.6
     assert_close(sun_image.color[empty], np.zeros((empty.sum(), 3)), ulps=0)
-    assert_close(sun_image.visibility[empty], np.zeros(empty.sum()), ulps=0)
+    assert_close(sun_image.visibilities[0][empty], np.zeros(empty.sum()), ulps=0)
     assert_close(sun_image.surface.depth[empty], np.ones(empty.sum()), ulps=0)
     assert_close(sun_image.surface.covered, ~empty)
     assert float(sun_image.surface.depth[~empty].max()) < 1
@@ -189,16 +189,16 @@ def test_render_is_its_stages(sun_image):
     surface, shadow_map = stages(MESH, CAMERA, SUN)
     assert_close(sun_image.surface.face_ids, surface.face_ids)
     assert_close(sun_image.surface.position, surface.position)
-    assert_close(sun_image.shadow_map.depth, shadow_map.depth)
+    assert_close(sun_image.shadow_maps[0].depth, shadow_map.depth)
     lit = see(surface, SUN, shadow_map, SlopeBias(), HardCompare())
-    assert_close(sun_image.visibility, lit)
-    assert_close(sun_image.color, shade(surface, SUN, lit))
+    assert_close(sun_image.visibilities[0], lit)
+    assert_close(sun_image.color, shade(surface, [SUN], [lit]))
 
 
 def test_stored_depth_is_the_pixels_own_within_a_footprint(sun_image):
     """In the light, a texel holds the depth of the floor at its centre."""
-    receiver = quick(receive_surface)(sun_image.surface, SUN, sun_image.shadow_map)
-    (tap,) = NearestFilter().taps(sun_image.shadow_map, receiver)
+    receiver = quick(receive_surface)(sun_image.surface, SUN, sun_image.shadow_maps[0])
+    (tap,) = NearestFilter().taps(sun_image.shadow_maps[0], receiver)
     _, lit = sure_shadow(sun_image.surface, SUN, margin=0.05)
     lit &= np.asarray(tap.stored) < 1  # off the floor's rim
     gain = np.abs(receiver.depth - tap.stored)[lit] / np.asarray(receiver.footprint)[lit]
@@ -207,18 +207,24 @@ def test_stored_depth_is_the_pixels_own_within_a_footprint(sun_image):
 
 
 def test_kept_shadow_map_gives_the_same_image(sun_image):
-    """Here with a color for each face."""
-    face_colors = np.random.default_rng(0).uniform(0, 1, (BOX_FACES + FLOOR_FACES, 3))
     kept = quick(
-        lambda mesh, camera, light, shadow_map, base_color: render(
-            mesh, camera, light, image_size=IMAGE, shadow_map=shadow_map, base_color=base_color
+        lambda mesh, camera, light, shadow_map: render(
+            mesh, camera, light, image_size=IMAGE, shadow_maps=[shadow_map]
         )
     )
-    again = kept(MESH, CAMERA, SUN, sun_image.shadow_map, face_colors)
-    seen = face_colors[np.asarray(sun_image.surface.face_ids)]
-    expected = sun_image._replace(color=sun_image.color * seen)
-    for value, wanted in zip(jax.tree.leaves(again), jax.tree.leaves(expected), strict=True):
+    again = kept(MESH, CAMERA, SUN, sun_image.shadow_maps[0])
+    for value, wanted in zip(jax.tree.leaves(again), jax.tree.leaves(sun_image), strict=True):
         assert_close(value, wanted)
+
+
+def test_two_lights_add_up_and_ambient_counts_once(sun_image):
+    spot_image = draw(MESH, CAMERA, LIGHTS["spot"])
+    both = draw(MESH, CAMERA, (SUN, LIGHTS["spot"]))
+    ambient = np.where(np.asarray(both.surface.covered)[..., None], 0.1, 0.0)
+    assert_close(both.color, sun_image.color + spot_image.color - ambient)
+    for k, alone in enumerate((sun_image, spot_image)):
+        assert_close(both.visibilities[k], alone.visibilities[0])
+        assert_close(both.shadow_maps[k].depth, alone.shadow_maps[0].depth)
 
 
 def test_traces_once_for_other_values():
@@ -253,7 +259,7 @@ def test_world_turned_about_the_vertical_axis():
     for mesh, camera, light in ((MESH, CAMERA, spot), (turned_mesh, turned_camera, turned_spot)):
         surface, shadow_map = stages(mesh, camera, light)
         lit = see(surface, light, shadow_map, SlopeBias(), HardCompare())
-        images.append(np.asarray(shade(surface, light, lit)))
+        images.append(np.asarray(shade(surface, [light], [lit])))
     assert (np.abs(images[0] - images[1]) > 1e-6).mean() < 2e-3  # measured
 
 
@@ -296,7 +302,7 @@ def colors(surface, light, shadow_map, length, softness):
         filter=BilinearFilter(),
         compare=SoftCompare(softness),
     )
-    return shade(surface, light, lit)
+    return shade(surface, [light], [lit])
 
 
 def test_image_has_its_derivative_in_bias_and_softness():

@@ -4,11 +4,19 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.scenes import EMBEDDED, load_scene
+from experiments.scene import Material
+from experiments.scenes import EMBEDDED, SHADOW_SCENES, load_scene
 from shadows.bias import CombinedBias, ConstantBias, SlopeBias
 from shadows.lights import DirectionalLight, SpotLight
+from tangentspace.environment import sample_cube_map
+from tangentspace.mikktspace import with_tangents
+from tangentspace.normal_map import decode_normals
+from tangentspace.pixel_frame import perturb_normal
+from tangentspace.texture import clamp, repeat, sample_bilinear
 
 from .studies import study
+from .test_mtl import texels_of
+from .tools import assert_close
 
 ZERO = CombinedBias()
 FLOOR = 0.0
@@ -55,7 +63,7 @@ def test_a_scene_is_sound(name):
     np.testing.assert_allclose(np.linalg.norm(light.direction), 1, rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", EMBEDDED)
+@pytest.mark.parametrize("name", SHADOW_SCENES)
 def test_zero_bias_shows_acne_and_a_camera_sees_light_and_shadow(name):
     errors = study(name).errors(ZERO)
     assert errors.acne > 0.2  # measured 0.49 to 0.51
@@ -147,3 +155,107 @@ def test_default_shows_acne_at_zero_bias_and_leaks_at_a_large_one():
     assert small.error < 0.01
     assert large.leak > 0.05
     assert large.leak > 5 * small.leak
+
+
+@pytest.mark.parametrize("name", SHADOW_SCENES)
+def test_scenes_of_shadows_have_no_maps_to_pay_for(name):
+    scene = load_scene(name)
+    assert scene.materials == (Material(),)
+    assert scene.environment is None
+
+
+def cells(scene):
+    """Return the faces of each of the 8 real and of the 8 flat cells."""
+    faces = np.asarray(scene.mesh.faces)
+    return [np.split(faces[scene.face_materials == kind], 8) for kind in (0, 1)]
+
+
+def test_normal_cells_are_turned_and_mirrored_in_all_ways():
+    scene = load_scene("normal-cells")
+    positions, uvs = np.asarray(scene.mesh.positions), np.asarray(scene.mesh.uvs)
+    found = set()
+    for real, flat in zip(*cells(scene), strict=True):
+        axes = []
+        for faces in (real, flat):
+            used = np.unique(faces)
+            middle = positions[used].mean(axis=0)
+            design = np.c_[uvs[used] - 0.5, np.ones(len(used))]
+            axes.append(np.linalg.lstsq(design, positions[used] - middle, rcond=None)[0][:2, :2])
+        np.testing.assert_allclose(axes[0], axes[1], atol=1e-4)  # du and dv in x, y; 1e-8
+        np.testing.assert_allclose(np.abs(axes[1]).sum(axis=1), 0.5, atol=1e-6)
+        found.add(tuple(np.sign(np.round(axes[1], 3)).astype(int).ravel()))
+        # The flat cell lies to the right of the real one, in the plane of its edge.
+        right = positions[flat].mean(axis=(0, 1)) - positions[real].mean(axis=(0, 1))
+        assert 0.4 < right[0] < 0.6
+        assert np.ptp(positions[flat][..., 2]) == 0
+        assert np.ptp(positions[real][..., 2]) > 0.07
+    assert len(found) == 8
+    determinants = [a * d - b * c for a, b, c, d in found]
+    assert sorted(determinants) == [-1] * 4 + [1] * 4
+
+
+def test_normal_cells_maps_hold_the_normals_of_the_real_cells():
+    scene = load_scene("normal-cells")
+    mesh = scene.mesh
+    texels = texels_of(scene.materials[1].normal_texture)
+    flat = mesh._replace(faces=np.concatenate(cells(scene)[1]))
+    tangents = with_tangents(flat).tangents
+    assert tangents is not None
+    for real, faces in zip(*cells(scene), strict=True):
+        used = np.unique(real)
+        leaning = decode_normals(
+            sample_bilinear(texels, mesh.uvs[used], wrap_u=clamp, wrap_v=clamp)
+        )
+        frame = np.repeat(np.asarray(tangents)[faces[:1, 0]], len(used), axis=0)
+        normals = perturb_normal(leaning, frame, mesh.normals[np.repeat(faces[0, 0], len(used))])
+        off = np.linalg.norm(np.asarray(normals) - mesh.normals[used], axis=1)
+        assert np.rad2deg(off).max() < 0.1  # measured 0.042
+        assert np.rad2deg(np.arccos(mesh.normals[used, 2].min())) > 30
+
+
+def test_no_bump_of_normal_cells_throws_a_shadow():
+    scene = load_scene("normal-cells")
+    light = to_sun(scene)
+    steepest = np.arccos(np.asarray(scene.mesh.normals)[:, 2].min())
+    assert steepest < np.pi / 2 - np.arccos(light[2]) - np.deg2rad(10)
+
+
+def test_bumpy_tiles_its_normal_map_without_a_seam():
+    scene = load_scene("bumpy")
+    texture = scene.materials[1].normal_texture
+    texels = texels_of(texture)
+    assert texture.wrap_u is texture.wrap_v is repeat
+    normals = 2 * texels - 1
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1, atol=1e-6)
+    assert_close(normals[[0, -1]], np.broadcast_to(np.float32([0, 0, 1]), (2, 64, 3)))
+    assert_close(normals[:, [0, -1]], np.broadcast_to(np.float32([0, 0, 1]), (64, 2, 3)))
+    assert np.rad2deg(np.arccos(normals[..., 2].min())) > 35
+    uvs = np.asarray(scene.mesh.uvs)[4:]  # behind the floor's
+    np.testing.assert_allclose(np.ptp(uvs, axis=0), [12, 5], rtol=1e-6)
+    # Knobs rise: on the right of the middle the normals lean to the right, above it up.
+    assert normals[32, 44, 0] > 0.3
+    assert normals[20, 32, 1] > 0.3
+
+
+def test_mirror_stands_under_its_own_sun():
+    scene = load_scene("mirror")
+    assert scene.environment is not None
+    assert [material.reflectivity for material in scene.materials] == [None, 0.8]
+    directions = np.array([to_sun(scene), [0, 1, 0], [0, -1, 0]], np.float32)
+    sun, zenith, ground = np.asarray(sample_cube_map(scene.environment, directions))
+    assert sun.min() > 2.5
+    assert zenith[2] > 2 * zenith[0]
+    assert ground.max() < 0.3
+    assert scene.environment.faces.dtype == np.float32
+
+
+def test_displaced_rises_from_a_level_sheet():
+    scene = load_scene("displaced")
+    (material,) = scene.materials
+    heights = texels_of(material.height_texture)
+    assert heights.shape == (128, 128, 1)
+    assert heights.min() >= 0
+    edge = np.concatenate([heights[[0, -1]].ravel(), heights[:, [0, -1]].ravel()])
+    assert edge.max() < 0.05 < 0.9 < heights.max() < 1.1  # the border stays down
+    assert np.ptp(scene.mesh.positions[:, 1]) == 0
+    assert np.unravel_index(heights.argmax(), heights.shape)[0] > 64  # low in the image: small v

@@ -1,0 +1,72 @@
+"""What the eye sees at each pixel, before any light: face, place and directions."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from tangentspace._math import dot, safe_normalize
+from tangentspace.mesh import Mesh
+from tangentspace.vertex_normals import face_normals
+
+from .interpolate import barycentrics, gather_faces, interpolate
+from .rasterize import rasterize
+from .transforms import Camera, transform_points
+
+
+class Surface(NamedTuple):
+    """What the eye sees at each pixel, before any light.
+
+    Attributes:
+        face_ids: The face, -1 where there is none.
+        depth: Window depth in [0, 1], 1 where there is none.
+        position: World space.
+        face_normal: Unit normal of the face, turned to the camera's side.
+        normal: Unit shading normal, interpolated, turned with the face's.
+        to_camera: Unit vector towards the eye.
+        weights: Barycentric weights of the face's corners, to interpolate more with.
+    """
+
+    face_ids: Int[Array, "height width"]
+    depth: Float[Array, "height width"]
+    position: Float[Array, "height width 3"]
+    face_normal: Float[Array, "height width 3"]
+    normal: Float[Array, "height width 3"]
+    to_camera: Float[Array, "height width 3"]
+    weights: Float[Array, "height width 3"]
+
+    @property
+    def covered(self) -> Bool[Array, "height width"]:
+        """Whether there is a surface at the pixel."""
+        return self.face_ids >= 0
+
+
+def render_surface(mesh: Mesh, camera: Camera, *, image_size: tuple[int, int]) -> Surface:
+    """Rasterize the mesh from the eye and interpolate what shading needs.
+
+    Args:
+        mesh: World space.
+        camera: The view; its aspect ratio follows the image's.
+        image_size: Height and width in pixels.
+
+    Differentiability:
+        Smooth in positions, normals and the camera inside each face; see ``rasterize``.
+    """
+    positions, faces = jnp.asarray(mesh.positions), jnp.asarray(mesh.faces)
+    clip = transform_points(camera.clip_from_world(image_size[1] / image_size[0]), positions)
+    raster = rasterize(clip, faces, image_size=image_size)
+    weights = barycentrics(clip, faces, raster.face_ids)
+    position = interpolate(positions, faces, raster.face_ids, weights)
+    normal = safe_normalize(interpolate(mesh.normals, faces, raster.face_ids, weights))
+    face_normal = gather_faces(face_normals(positions, faces), raster.face_ids)
+    to_camera = camera.to_camera(position)
+    away = (dot(face_normal, to_camera) < 0)[..., None]
+    return Surface(
+        raster.face_ids,
+        raster.depth,
+        position,
+        jnp.where(away, -face_normal, face_normal),
+        jnp.where(away, -normal, normal),
+        to_camera,
+        weights,
+    )
