@@ -30,11 +30,19 @@ def _run(arguments: Sequence[str]) -> int:
     # Loaded here, so that an interrupt while they load, which takes seconds, ends well too.
     import jax
 
-    from .fit_bias_command import fit
+    from .bake_command import bake
+    from .fit_bias_command import fit as fit_bias
+    from .fit_normal_map_command import fit as fit_normal_map
     from .render_command import render
 
+    commands = {
+        "render": render,
+        "fit-bias": fit_bias,
+        "fit-normal-map": fit_normal_map,
+        "bake-normals": bake,
+    }
     try:
-        _parse(arguments, {"render": render, "fit-bias": fit})()
+        _parse(arguments, commands)()
     except BrokenPipeError:
         raise
     except (ValueError, OSError) as error:
