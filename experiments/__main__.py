@@ -51,7 +51,7 @@ def _run(arguments: Sequence[str]) -> int:
     except (MemoryError, jax.errors.JaxRuntimeError) as error:
         if isinstance(error, jax.errors.JaxRuntimeError) and "RESOURCE_EXHAUSTED" not in str(error):
             raise
-        say_error("out of memory; choose a smaller image or shadow map")
+        say_error("out of memory; choose a smaller image or map")
         return 2
     return 0
 

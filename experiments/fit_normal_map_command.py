@@ -17,7 +17,7 @@ from .fit_normal_map import MapFit
 from .images import atomic_path, read_image
 from .light_file import read_lights
 from .map_files import write_normal_map
-from .normal_map_evidence import Evidence, gather_evidence, undetermined
+from .normal_map_evidence import Evidence, gather_evidence, seen_texels, undetermined
 from .normal_map_report import tell, write_results
 from .normal_map_study import MapStudy, errors_of, load_study, make_study, texels_of
 from .normal_map_task import Task, Unknowns, free_leaves
@@ -189,6 +189,7 @@ def _run(
     """Solve to the end; after every few steps tell the loss, draw the map, store the state."""
     history: list[dict[str, float]] = []
     seconds = 0.0
+    seen = seen_texels(task.view)
     value = jax.jit(lambda task, unknowns: sum(jnp.sum(r**2) for r in task.residuals(unknowns)))
     with stage("fitting") as report:
         while True:
@@ -199,7 +200,7 @@ def _run(
                 "loss": 0.5 * float(value(task, unknowns)),
             }
             if study.truth is not None:
-                row["mean_error"] = float(errors_of(study, unknowns.slopes).mean())
+                row["mean_error"] = float(errors_of(study, unknowns.slopes)[seen].mean())
             history.append(row)
             report(", ".join(f"{name} {number:.4g}" for name, number in row.items()))
             write_normal_map(out / "progress.png", texels_of(unknowns.slopes), bits=8)

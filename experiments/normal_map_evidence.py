@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .normal_map_information import texel_information, to_texels
 from .normal_map_task import Task, Unknowns, free_leaves
+from .normal_map_views import View
 
 ENOUGH_LIGHTS = 3
 _ENOUGH = 0.5  # of a pixel: less of it at a texel does not count
@@ -49,7 +50,7 @@ def gather_evidence(task: Task, unknowns: Unknowns) -> Evidence:
     """Return how well each texel is known at the end of a fit."""
     view = task.view
     information = texel_information(task, unknowns)
-    seen = to_texels(view, np.ones(view.lit.shape[1])) >= _ENOUGH
+    seen = seen_texels(view)
     reached = [to_texels(view, tells.astype(float)) >= _ENOUGH for tells in information.tells]
     residuals = 3 * float(np.asarray(view.lit).sum())
     free = max(residuals - 2 * seen.sum(), 0.05 * residuals, 1.0)
@@ -61,6 +62,11 @@ def gather_evidence(task: Task, unknowns: Unknowns) -> Evidence:
     variance = np.trace(inverse @ information.metric, axis1=-2, axis2=-1)
     error = np.where(told, np.rad2deg(noise * np.sqrt(variance)), np.inf)
     return Evidence(seen, np.sum(reached, axis=0), noise, error)
+
+
+def seen_texels(view: View) -> Bool[np.ndarray, "height width"]:
+    """Return which texels at least half a pixel shows."""
+    return to_texels(view, np.ones(view.lit.shape[1])) >= _ENOUGH
 
 
 def undetermined(task: Task, unknowns: Unknowns, names: Sequence[str]) -> list[str]:

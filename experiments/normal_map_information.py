@@ -80,4 +80,4 @@ def _at_pixels(task: Task, unknowns: Unknowns) -> tuple[Array, Array, Array]:
     squared = [sum(parts) for parts in zip(products[0], products[3], products[5], strict=True)]
     tells = jnp.stack([sum(squared[k : k + 3]) > _TELLS for k in range(0, len(squared), 3)])
     information = jnp.stack([sum(product) for product in products])
-    return tells, information, sum(jnp.sum(value**2) for value in values)
+    return tells, information, jnp.sum(jnp.stack([jnp.sum(value**2) for value in values]))

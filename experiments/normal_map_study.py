@@ -186,14 +186,14 @@ def _see(
     material = mapped_material(scene)
     texture = scene.materials[material].normal_texture
     plain = None if texture is None else _plain(texture)
-    if map_size is None:
-        map_size = DEFAULT_MAP_SIZE if plain is None else plain.texels.shape[:2]
+    if map_size is None and plain is not None:
+        map_size = (plain.texels.shape[0], plain.texels.shape[1])
     wraps = (repeat, repeat) if plain is None else (plain.wrap_u, plain.wrap_v)
     return see_map(
         scene,
         material,
         image_size=image_size,
-        map_size=map_size,
+        map_size=DEFAULT_MAP_SIZE if map_size is None else map_size,
         wraps=wraps,
         shadow_margin=shadow_margin,
     )

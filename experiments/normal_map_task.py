@@ -115,6 +115,7 @@ def free_leaves(
 
 def _of_unit_direction(light: Light) -> Light:
     """Return the light with its direction, if it has one, scaled to unit length."""
-    if not hasattr(light, "direction"):
+    direction = getattr(light, "direction", None)
+    if direction is None:
         return light
-    return eqx.tree_at(lambda li: li.direction, light, safe_normalize(light.direction))
+    return eqx.tree_at(lambda li: li.direction, light, safe_normalize(direction))

@@ -174,17 +174,17 @@ def see_map(
     frame = np.stack([tangent[:, :3], bitangent, normal]) * side[:, None]
     taps = bilinear_taps(map_size, jnp.asarray(uvs), wrap_u=wraps[0], wrap_v=wraps[1])
     color = _base_color(scene, material, uvs)
+    rows = lambda array: jnp.asarray(np.ascontiguousarray(array.T))
     view = View(
-        indices=taps.indices.T,
-        weights=taps.weights.T,
-        frame=np.moveaxis(frame, -1, 1),
-        to_camera=surface.to_camera[inside].T,
-        position=surface.position[inside].T,
-        lit=np.stack(lit).astype(np.float32),
-        base_color=None if color is None else color.T,
+        indices=rows(np.asarray(taps.indices)),
+        weights=rows(np.asarray(taps.weights)),
+        frame=jnp.asarray(np.ascontiguousarray(np.moveaxis(frame, -1, 1))),
+        to_camera=rows(surface.to_camera[inside]),
+        position=rows(surface.position[inside]),
+        lit=jnp.asarray(np.stack(lit), normal.dtype),
+        base_color=None if color is None else rows(color),
         map_size=map_size,
     )
-    view = jax.tree.map(lambda a: jnp.asarray(np.ascontiguousarray(a)), view)
     return SeenMap(surface, inside, view, visibility)
 
 

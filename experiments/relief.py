@@ -67,7 +67,7 @@ def _patch() -> Mesh:
     x, _, z = flat.positions.T
     heights = 0.15 * np.cos(1.2 * x) * np.cos(1.2 * z)
     positions = np.stack([x, heights.astype(np.float32), z], axis=-1)
-    normals = smooth_normals(positions, flat.faces).astype(np.float32)
+    normals = smooth_normals(positions, np.asarray(flat.faces)).astype(np.float32)
     return flat._replace(positions=positions, normals=normals)
 
 

@@ -96,6 +96,10 @@ def render(
     height_scale: Annotated[
         float, tyro.conf.arg(metavar="LENGTH", help="World length that a height of 1 stands for.")
     ] = 1.0,
+    subdivisions: Annotated[
+        int,
+        tyro.conf.arg(metavar="N", help="Cut each face in four so often before displacing it."),
+    ] = 0,
     environment: Annotated[
         tuple[Path, ...],
         tyro.conf.arg(
@@ -135,6 +139,8 @@ def render(
         raise ValueError(f"--reflectivity: expected a share from 0 to 1, got {reflectivity}")
     if not np.isfinite(height_scale):
         raise ValueError(f"--height-scale: expected a finite length, got {height_scale}")
+    if subdivisions < 0:
+        raise ValueError(f"--subdivisions: expected at least 0, got {subdivisions}")
     if flip_green and normal_map is None:
         raise ValueError("--flip-green: is for --normal-map, which is not given; drop it")
     with stage(f"loading {scene}"):
@@ -145,6 +151,7 @@ def render(
             flip_green=flip_green,
             height_map=height_map,
             height_scale=height_scale,
+            subdivisions=subdivisions,
             environment=environment,
             reflectivity=reflectivity,
         )

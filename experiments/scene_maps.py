@@ -13,6 +13,7 @@ from .cube_files import read_cube_map
 from .framing import FLOOR
 from .map_files import read_color_map, read_height_map, read_normal_map
 from .scene import Scene
+from .subdivide import subdivide
 
 
 def with_maps(
@@ -23,6 +24,7 @@ def with_maps(
     flip_green: bool = False,
     height_map: Path | None = None,
     height_scale: float = 1.0,
+    subdivisions: int = 0,
     environment: Sequence[Path] = (),
     reflectivity: float | None = None,
 ) -> Scene:
@@ -35,6 +37,7 @@ def with_maps(
         flip_green: Whether its green points down (-Y).
         height_map: Image file of heights, by which vertices are displaced.
         height_scale: World length that a height of 1 stands for.
+        subdivisions: How often each face is cut in four before vertices are displaced.
         environment: Six image files in the order +x -x +y -y +z -z, or a folder of them.
         reflectivity: Share of the mirrored environment in the color, in [0, 1].
 
@@ -57,6 +60,9 @@ def with_maps(
     if changes and scene.mesh.uvs is None:
         given = next(str(f) for f in (normal_map, color_map, height_map) if f is not None)
         raise ValueError(f"{scene.name}: has no uvs, which {given} needs; unwrap the mesh")
+    if subdivisions:
+        mesh, parents = subdivide(scene.mesh, subdivisions)
+        scene = scene._replace(mesh=mesh, face_materials=scene.face_materials[parents])
     if reflectivity is not None:
         changes["reflectivity"] = np.float32(reflectivity)
     if changes:

@@ -151,7 +151,7 @@ def _normals(
     mesh: Mesh, surface: Surface, regions: Sequence[_Region], places: _Places
 ) -> tuple[Float[Array, "height width 3"], Float[Array, "height width"] | None]:
     """Return the shading normals, and their coherence where a map with mips was asked."""
-    mapped = [region for region in regions if region.material.normal_texture is not None]
+    mapped = [(m, m.normal_texture, i) for m, i in regions if m.normal_texture is not None]
     if not mapped:
         return surface.normal, None
     ids, weights = surface.face_ids, surface.weights
@@ -159,8 +159,7 @@ def _normals(
     raw = jnp.broadcast_to(flat, surface.normal.shape)
     anywhere = jnp.zeros_like(surface.covered)
     coherence = None
-    for material, inside in mapped:
-        texture = material.normal_texture
+    for material, texture, inside in mapped:
         normals = decode_normals(places.look_up(texture))
         if isinstance(texture, MippedTexture):
             before = jnp.ones_like(normals[..., 0]) if coherence is None else coherence
@@ -170,7 +169,8 @@ def _normals(
         raw = jnp.where(inside[..., None], normals, raw)
         anywhere = anywhere | inside
     smooth = interpolate(mesh.normals, mesh.faces, ids, weights)
-    bumped = perturb_normal(raw, interpolate(mesh.tangents, mesh.faces, ids, weights), smooth)
+    tangents = jnp.asarray(mesh.tangents)
+    bumped = perturb_normal(raw, interpolate(tangents, mesh.faces, ids, weights), smooth)
     turned = (dot(smooth, surface.normal) < 0)[..., None]
     normal = jnp.where(turned, -bumped, bumped)
     return jnp.where(anywhere[..., None], normal, surface.normal), coherence

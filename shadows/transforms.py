@@ -102,7 +102,8 @@ def transform_points(
     matrix: Float[Array, "4 4"], points: Float[Array | np.ndarray, "... 3"]
 ) -> Float[Array, "... 4"]:
     """Apply a matrix to points (w = 1) and keep all four coordinates."""
-    return jnp.asarray(points) @ matrix[:, :3].T + matrix[:, 3]
+    # On an accelerator a product of matrices would be rounded to fewer bits.
+    return jnp.matmul(points, matrix[:, :3].T, precision="highest") + matrix[:, 3]
 
 
 class PerspectiveCamera(eqx.Module):

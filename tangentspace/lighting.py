@@ -236,12 +236,12 @@ def _arriving(radiance: Colors, share: Scalars) -> Float[Array, "..."]:
     return jnp.asarray(share)[..., None] * jnp.asarray(radiance)
 
 
-def clamp_cosine(cosine: Float[Array, "..."]) -> Float[Array, "..."]:
+def clamp_cosine(cosine: Float[Array | np.ndarray, "..."]) -> Float[Array, "..."]:
     """Clamp to [0, 1], with derivative 0 at both ends (``jnp.clip`` halves it there)."""
     return jnp.where(cosine <= 0, 0.0, jnp.where(cosine >= 1, 1.0, cosine))
 
 
-def lobe(cosine: Float[Array, "..."], shininess: Scalars) -> Float[Array, "..."]:
+def lobe(cosine: Float[Array | np.ndarray, "..."], shininess: Scalars) -> Float[Array, "..."]:
     """Raise the clamped cosine to a power, whose derivative at 0 is 0 for any exponent."""
     dark = cosine <= 0
     return jnp.where(dark, 0.0, jnp.where(dark, 1.0, clamp_cosine(cosine)) ** shininess)

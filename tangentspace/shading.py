@@ -18,6 +18,7 @@ from ._math import dot
 from .lighting import Colors, Directions, Scalars, clamp_cosine, lobe
 from .normal_filtering import toksvig_gloss
 
+Cosines = Float[Array | np.ndarray, "..."]
 Coefficient = Float[Array | np.ndarray, ""] | Float[Array | np.ndarray, "3"] | float
 
 _OF_WHITE, _EXPONENT = {"unit": "of white"}, {"unit": "exponent"}
@@ -50,7 +51,7 @@ class Shading(eqx.Module):
 
     @abc.abstractmethod
     def terms(
-        self, n_dot_l: Scalars, n_dot_v: Scalars, l_dot_v: Scalars, *, gloss: Scalars = 1.0
+        self, n_dot_l: Cosines, n_dot_v: Cosines, l_dot_v: Cosines, *, gloss: Scalars = 1.0
     ) -> Terms:
         """Return what is reflected, from the cosines between normal, light and camera.
 
@@ -103,7 +104,7 @@ class Shading(eqx.Module):
         if not isinstance(highlight, float):
             reflected = reflected + _times(highlight, self.specular)
         unlit = _scaled(self.ambient, base_color) if ambient is None else ambient
-        color = jnp.asarray(unlit) + _times(jnp.asarray(visibility), radiance) * reflected
+        color = jnp.asarray(unlit) + _times(visibility, radiance) * reflected
         return jnp.broadcast_to(color, (*color.shape[:-1], 3))
 
 
@@ -124,7 +125,7 @@ class LambertShading(Shading):
         return 0.0
 
     def terms(
-        self, n_dot_l: Scalars, n_dot_v: Scalars, l_dot_v: Scalars, *, gloss: Scalars = 1.0
+        self, n_dot_l: Cosines, n_dot_v: Cosines, l_dot_v: Cosines, *, gloss: Scalars = 1.0
     ) -> Terms:
         """Return the clamped cosine of the light, and no highlight."""
         return Terms(clamp_cosine(n_dot_l), 0.0)
@@ -146,7 +147,7 @@ class PhongShading(Shading):
     ambient: Coefficient = eqx.field(default=0.1, metadata=_OF_WHITE)
 
     def terms(
-        self, n_dot_l: Scalars, n_dot_v: Scalars, l_dot_v: Scalars, *, gloss: Scalars = 1.0
+        self, n_dot_l: Cosines, n_dot_v: Cosines, l_dot_v: Cosines, *, gloss: Scalars = 1.0
     ) -> Terms:
         """Return those of ``lighting.phong``."""
         exponent = self.shininess * gloss
@@ -177,7 +178,7 @@ class BlinnPhongShading(Shading):
     ambient: Coefficient = eqx.field(default=0.1, metadata=_OF_WHITE)
 
     def terms(
-        self, n_dot_l: Scalars, n_dot_v: Scalars, l_dot_v: Scalars, *, gloss: Scalars = 1.0
+        self, n_dot_l: Cosines, n_dot_v: Cosines, l_dot_v: Cosines, *, gloss: Scalars = 1.0
     ) -> Terms:
         """Return those of ``lighting.blinn_phong``."""
         exponent = self.shininess * gloss
@@ -201,6 +202,6 @@ def _scaled(coefficient: Coefficient, base_color: Colors) -> Colors:
     return coefficient * jnp.asarray(base_color)
 
 
-def _times(scalar: Float[Array, "..."], color: Colors) -> Float[Array, "..."]:
+def _times(scalar: Scalars, color: Colors) -> Float[Array, "..."]:
     """Multiply a number per pixel, which has no channels, with a color."""
-    return scalar[..., None] * jnp.asarray(color)
+    return jnp.asarray(scalar)[..., None] * jnp.asarray(color)
