@@ -7,14 +7,17 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 INSTALL := $(PIP) install --constraint constraints.txt --build-constraint constraints.txt
 
-.PHONY: help fit render test style lint bench notebooks clean
+.PHONY: help fit normal-map render test style lint bench notebooks clean
 .DEFAULT_GOAL := help
 
 help: ## list the jobs
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' Makefile
 
 fit: $(VENV)/run.stamp ## fit a shadow bias against ray-traced truth, into results/fit
 	$(BIN)/python -m experiments fit-bias --out results/fit
+
+normal-map: $(VENV)/run.stamp ## recover a normal map from six images, into results/normal_map
+	$(BIN)/python -m experiments fit-normal-map --out results/normal_map
 
 render: $(VENV)/run.stamp ## render a scene with its shadow map, into results/render
 	@mkdir -p results/render
@@ -34,6 +37,8 @@ lint: style ## check form and types (pyright fetches itself with npm)
 bench: $(VENV)/run.stamp ## time the stages (leave the machine alone), into results/bench.json
 	@mkdir -p results
 	$(BIN)/python -m experiments.bench --out results/bench.json
+	$(BIN)/python -m experiments.bench_frames --out results/frames.json
+	$(BIN)/python -m experiments.bench_normal_map --out results/normal_map.json
 
 notebooks: $(VENV)/test.stamp ## execute the notebooks in place
 	$(BIN)/jupyter-execute --inplace notebooks/*.ipynb
