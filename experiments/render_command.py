@@ -215,7 +215,7 @@ def shadow_map_channels(shadow_maps: Sequence[ShadowMap]) -> Channels:
     return _numbered("depth", "Z", [shadow_map.depth for shadow_map in shadow_maps])
 
 
-def _numbered(layer: str, channel: str, images: Sequence[Array]) -> Channels:
+def _numbered(layer: str, channel: str, images: Sequence[Array | np.ndarray]) -> Channels:
     """Return ``depth.Z`` for the first light, ``depth2.Z`` for the second, and so on."""
     return {
         f"{layer}{'' if k == 0 else k + 1}.{channel}": np.asarray(image)

@@ -354,7 +354,7 @@ OPTIONS = {
     "option": ([*RENDER, "--image-sise", "5", "5"], "--image-sise.*--image-size"),
     "type": ([*RENDER, "--shadow-map-size", "1.5"], "--shadow-map-size"),
     "one size": ([*RENDER, "--image-size", "5"], "--image-size"),
-    "choice": ([*RENDER, "--shading", "toon"], "toon.*--shading.*lambert"),
+    "choice": ([*RENDER, "--shading", "toon"], "--shading toon: no such.*lambert"),
     "zero size": ([*RENDER, "--image-size", "0", "5"], "--image-size: .* got 0 5"),
     "huge map": ([*FIT, "--shadow-map-size", "99999999999999"], "--shadow-map-size: .* 8192"),
     "bias": ([*FIT, "--bias", "slop=1"], "--bias slop=1: .*did you mean 'slope'"),

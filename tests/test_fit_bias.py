@@ -275,7 +275,7 @@ def test_a_trial_counts_what_the_metrics_count():
 )
 def test_a_trial_sees_what_a_whole_rendering_shows(bias):
     default = study("default")
-    _, surface, shadow_map = default.unbiased[1:]
+    surface, (shadow_map,) = default.unbiased.surface, default.unbiased.shadow_maps
     whole = jax.jit(
         lambda surface, shadow_map, bias: surface_visibility(
             surface,
