@@ -16,7 +16,7 @@ References:
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Num
 
 from tangentspace._math import safe_divide, stack3
 
@@ -113,11 +113,11 @@ def interpolate(
 
 
 def gather_faces(
-    attributes: Float[Array | np.ndarray, "faces channels"], face_ids: FaceIds
-) -> Float[Array, "height width channels"]:
+    attributes: Num[Array | np.ndarray, "faces channels"], face_ids: FaceIds
+) -> Num[Array, "height width channels"]:
     """Return a per-face attribute at each pixel; 0 where no face is."""
     values = jnp.asarray(attributes).at[jnp.maximum(face_ids, 0)].get(mode="clip")
-    return jnp.where(face_ids[..., None] >= 0, values, 0.0)
+    return jnp.where(face_ids[..., None] >= 0, values, jnp.zeros((), values.dtype))
 
 
 def window_depth(

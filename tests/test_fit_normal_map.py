@@ -46,10 +46,8 @@ SCENES = {"relief": relief, "shadowed-relief": shadowed_relief}
 
 @pytest.fixture(autouse=True)
 def _single_precision():
-    jax.config.update("jax_disable_most_optimizations", True)
     with jax.enable_x64(False):
         yield
-    jax.config.update("jax_disable_most_optimizations", False)
 
 
 def finished(fit, most=600):

@@ -246,7 +246,7 @@ def program(mesh, materials, **options):
         return render(mesh, camera, light, image_size=(12, 16), **options).color
 
     with jax.enable_x64(False):
-        return jax.jit(draw).trace(*arguments)
+        return quick(draw).trace(*arguments)
 
 
 def gathers(traced):

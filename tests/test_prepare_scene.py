@@ -268,8 +268,8 @@ def test_tangents_lie_on_the_displaced_surface():
     """Made after displacement; the file's follow it."""
     heights = height_texture(RANDOM.random((4, 4)))
     look = Material(normal_texture=normal_texture(), height_texture=heights, height_scale=0.5)
-    mesh = shapes.plane(segments=SEGMENTS)
-    given = mesh._replace(tangents=np.tile(np.float32([1, 0, 0, -1]), (25, 1)))
+    mesh, _ = sheets()
+    given = mesh._replace(tangents=np.tile(np.float32([1, 0, 0, -1]), (50, 1)))
     made, followed = (prepare_scene(scene_of(m, look)).mesh for m in (mesh, given))
     flat = prepare_scene(scene_of(mesh, dataclasses.replace(look, normal_texture=None))).mesh
     np.testing.assert_array_equal(made.tangents, with_tangents(flat).tangents)
@@ -282,7 +282,7 @@ def test_tangents_lie_on_the_displaced_surface():
 
 
 def test_heights_of_a_material_on_no_face_move_nothing():
-    mesh = shapes.plane(segments=SEGMENTS)
+    mesh, _ = sheets()
     unused = Material(height_texture=height_texture(np.ones((2, 2))))
     prepared = prepare_scene(scene_of(mesh, Material(), unused))
     assert_close(prepared.mesh.positions, mesh.positions, ulps=0)
