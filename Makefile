@@ -38,7 +38,6 @@ bench: $(VENV)/run.stamp ## time the stages (leave the machine alone), into resu
 	@mkdir -p results
 	$(BIN)/python -m experiments.bench --out results/bench.json
 	$(BIN)/python -m experiments.bench_frames --out results/frames.json
-	$(BIN)/python -m experiments.bench_normal_map --out results/normal_map.json
 
 notebooks: $(VENV)/test.stamp ## execute the notebooks in place
 	$(BIN)/jupyter-execute --inplace notebooks/*.ipynb
