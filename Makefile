@@ -25,7 +25,7 @@ render: $(VENV)/run.stamp ## render a scene with its shadow map, into results/re
 	  --png-out results/render/image.png --shadow-map-out results/render/shadow_map.exr
 
 test: $(VENV)/test.stamp ## run the tests
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile $(PYTEST_ARGS)
 
 style: $(VENV)/dev.stamp ## check the form of the code
 	$(BIN)/ruff check
@@ -38,6 +38,7 @@ bench: $(VENV)/run.stamp ## time the stages (leave the machine alone), into resu
 	@mkdir -p results
 	$(BIN)/python -m experiments.bench --out results/bench.json
 	$(BIN)/python -m experiments.bench_frames --out results/frames.json
+	$(BIN)/python -m experiments.bench_normal_map --out results/normal_map.json
 
 notebooks: $(VENV)/test.stamp ## execute the notebooks in place
 	$(BIN)/jupyter-execute --inplace notebooks/*.ipynb

@@ -185,9 +185,9 @@ def _check_settings(path: Path, settings: Mapping[str, Any]) -> None:
 
 def _run(
     under_way: MapFit, task: Task, study: MapStudy, out: Path, steps: int
-) -> list[dict[str, float]]:
+) -> list[dict[str, int | float]]:
     """Solve to the end; after every few steps tell the loss, draw the map, store the state."""
-    history: list[dict[str, float]] = []
+    history: list[dict[str, int | float]] = []
     seconds = 0.0
     seen = seen_texels(task.view)
     value = jax.jit(lambda task, unknowns: sum(jnp.sum(r**2) for r in task.residuals(unknowns)))
@@ -218,7 +218,7 @@ def _summary(
     unknowns: Unknowns,
     evidence: Evidence,
     under_way: MapFit,
-    history: Sequence[Mapping[str, float]],
+    history: Sequence[Mapping[str, int | float]],
     free: Sequence[str],
     unclear: Sequence[str],
 ) -> dict[str, Any]:

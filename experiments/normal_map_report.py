@@ -23,7 +23,7 @@ def write_results(
     task: Task,
     ends: tuple[Unknowns, Unknowns],
     evidence: Evidence,
-    history: Sequence[Mapping[str, float]],
+    history: Sequence[Mapping[str, int | float]],
 ) -> None:
     """Write the map, how well each texel is known, and the pictures."""
     start, unknowns = ends

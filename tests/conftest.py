@@ -21,6 +21,13 @@ hypothesis.settings.register_profile("tests", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("tests")
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _compiled_functions_end_with_their_module():
+    """Free what a module compiled: some thousand programs exceed what a process may map."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture(params=[np.float32, np.float64], ids=["float32", "float64"])
 def dtype(request):
     """Run the test in single precision, where users live, and in double."""

@@ -70,7 +70,6 @@ def camera_on_axis(side=1.0, dtype=np.float64):
 
 
 MESH, CAMERA = tiles(), camera_on_axis()
-UPRIGHT = tiles(axes=np.repeat(AXES[:1], 4, axis=0))
 
 
 @pytest.fixture(scope="module")
@@ -185,11 +184,16 @@ def test_colors_with_mips_are_means_where_minified(front):
         assert_close(seen.base_color[TILES[tile]], expected, ulps=256)  # measured 18
 
 
+def test_the_longer_footprint_chooses_the_mip_whichever_way_it_lies(front):
+    """Four texels a pixel along u, which runs to the right on two tiles and upwards on two."""
+    stripes = np.broadcast_to(RANDOM.random((1, 4 * SIDE, 3)), (SIDE, 4 * SIDE, 3))
+    means = np.repeat(stripes[:1].reshape(1, SIDE, 4, 3).mean(axis=2), SIDE, axis=0)
+    seen = looks(MESH, CAMERA, front, [Material(base_color_texture=with_mips(Texture(stripes)))])
+    for tile in range(4):
+        assert_close(seen.base_color[TILES[tile]], on_tile(means, AXES[tile]), ulps=256)
+
+
 # Normals
-
-
-def mapped_materials(texture, scale=None):
-    return [Material(normal_texture=texture, normal_scale=scale), Material((0.5, 0.5, 0.5))]
 
 
 @pytest.mark.parametrize("scale", [None, 0.5, -2.0])

@@ -333,7 +333,7 @@ def test_forward_and_reverse_derivatives_agree_with_finite_differences():
     assert forward.dtype == np.float64
     assert np.abs(forward).max() > 0.1
     assert_close(reverse, forward)
-    np.testing.assert_allclose(central, forward, atol=1e-8)  # measured FD
+    np.testing.assert_allclose(central, forward, atol=1e-8)  # measured 2e-9
 
 
 def test_the_residual_is_traced_once_for_all_levels(monkeypatch):

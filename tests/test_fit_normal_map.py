@@ -24,7 +24,7 @@ from experiments.normal_map_study import (
 )
 from experiments.normal_map_task import Task, Unknowns, free_leaves, free_names
 from experiments.prepare_scene import prepare_scene
-from experiments.relief import relief, shadowed_relief
+from experiments.relief import shadowed_relief
 from shadows.lights import DirectionalLight, PointLight, SpotLight
 from tangentspace.normal_map import (
     decode_normals,
@@ -40,8 +40,6 @@ from .test_normal_map_views import LIGHTS, float32, quick, studio, unit
 from .tools import assert_close
 
 IMAGE, SIDE = (64, 64), 32
-PIXELS = 3300  # of the relief's: one shape with and without shadows
-SCENES = {"relief": relief, "shadowed-relief": shadowed_relief}
 
 
 @pytest.fixture(autouse=True)
@@ -57,27 +55,23 @@ def finished(fit, most=600):
 
 
 @functools.cache
-def prepared(name):
-    return prepare_scene(SCENES[name](size=SIDE), tangents=True)
+def prepared():
+    """The relief with posts on it, which throw shadows under each of its six lights."""
+    with jax.enable_x64(False):
+        return prepare_scene(shadowed_relief(size=SIDE), tangents=True)
 
 
 @functools.cache
-def relief_study(name, noise=0.0):
-    return make_study(prepared(name), PhongShading(), image_size=IMAGE, noise=noise)
-
-
-def thinned(study):
-    """Return a task of so many pixels of a study."""
-    count = study.seen.view.lit.shape[1]
-    chosen = np.linspace(0, count - 1, PIXELS).astype(int)
-    return jax.tree.map(lambda a: a[..., chosen], Task(study.seen.view, study.targets))
+def relief_study(noise=0.0):
+    with jax.enable_x64(False):
+        return make_study(prepared(), PhongShading(), image_size=IMAGE, noise=noise)
 
 
 @functools.cache
-def relief_fit(name, noise=0.0):
-    """Return the study, the task and the finished fit of a relief under six lights."""
-    study = relief_study(name, noise)
-    task = thinned(study)
+def relief_fit(noise=0.0):
+    """Return the study, the task and the finished fit of the relief."""
+    study = relief_study(noise)
+    task = Task(study.seen.view, study.targets)
     return study, task, finished(MapFit(task, study.shading, study.lights))
 
 
@@ -88,9 +82,8 @@ def rms(values):
 # Six lights
 
 
-@pytest.mark.parametrize("name", SCENES)
-def test_six_lights_without_noise_give_the_map(name):
-    study, task, fit = relief_fit(name)
+def test_six_lights_without_noise_give_the_map():
+    study, task, fit = relief_fit()
     evidence = gather_evidence(task, fit.unknowns)
     errors = errors_of(study, fit.unknowns.slopes)[evidence.known]
     assert fit.converged
@@ -102,9 +95,8 @@ def test_six_lights_without_noise_give_the_map(name):
     assert flat.mean() > 10  # where it started
 
 
-@pytest.mark.parametrize("name", SCENES)
-def test_one_percent_of_noise_gives_the_error_that_is_predicted(name):
-    study, task, fit = relief_fit(name, 0.01)
+def test_one_percent_of_noise_gives_the_error_that_is_predicted():
+    study, task, fit = relief_fit(0.01)
     evidence = gather_evidence(task, fit.unknowns)
     known = evidence.known
     errors = errors_of(study, fit.unknowns.slopes)[known]
@@ -114,60 +106,54 @@ def test_one_percent_of_noise_gives_the_error_that_is_predicted(name):
 
 
 def test_texels_in_shadow_are_told_by_fewer_lights_and_fitted_from_the_others():
-    study, task, fit = relief_fit("shadowed-relief")
+    study, task, fit = relief_fit()
     evidence = gather_evidence(task, fit.unknowns)
     lit = np.asarray(task.view.lit)
     assert ((lit == 0).mean(axis=1) > 0.005).all()  # under every light
     some = evidence.known & (evidence.lights < 6)
     assert some.sum() > 30
     errors = errors_of(study, fit.unknowns.slopes)
-    assert errors[some].mean() <= 0.01  # measured SS
-    _, full_task, full = relief_fit("relief")
-    assert gather_evidence(full_task, full.unknowns).lights.min() == 6
+    assert errors[some].mean() <= 0.01  # measured 0.0002
+    assert (evidence.lights == 6).mean() > 0.8
 
 
 def test_texels_that_no_pixel_shows_keep_their_start_to_the_bit():
-    study = relief_study("relief")
-    task = thinned(study)
+    study, task, _ = relief_fit()
+    pixels = task.view.lit.shape[1]
     hole = np.zeros((SIDE, SIDE), bool)
     hole[9:17, 12:23] = True
     inside = hole.ravel()[np.asarray(task.view.indices)].any(axis=0)
-    # As if these pixels looked at the corner of the map: the shapes stay.
-    view = task.view
-    elsewhere = np.flatnonzero(~inside)[: inside.sum()]
-    keep = np.arange(PIXELS)
-    keep[inside] = elsewhere
-    task = jax.tree.map(lambda a: a[..., keep], task)
-    assert isinstance(view, type(task.view))
+    # Pixels that show the hole become copies of others: so nothing is compiled again.
+    chosen = np.where(inside, np.flatnonzero(~inside)[np.arange(pixels) % 100], np.arange(pixels))
+    task = jax.tree.map(lambda a: a[..., chosen], task)
     slopes = 0.2 * np.random.default_rng(5).normal(size=(SIDE, SIDE, 2)).astype(np.float32)
     fit = finished(MapFit(task, study.shading, study.lights, slopes=jnp.asarray(slopes)))
-    touched = to_texels(task.view, np.ones(PIXELS)) > 0
-    assert not touched[9:17, 12:23].any()
+    shown = to_texels(task.view, np.ones(pixels))
+    assert not shown[hole].any()
     found = np.asarray(fit.unknowns.slopes)
-    np.testing.assert_array_equal(found[~touched], slopes[~touched])
+    np.testing.assert_array_equal(found[shown == 0], slopes[shown == 0])
     evidence = gather_evidence(task, fit.unknowns)
-    assert not evidence.seen[~touched].any()
-    assert not evidence.known[~touched].any()
-    assert np.isinf(evidence.standard_error[~touched]).all()
+    for flag in (evidence.seen, evidence.known, np.isfinite(evidence.standard_error)):
+        assert not flag[shown == 0].any()
     errors = errors_of(study, fit.unknowns.slopes)
-    rim = touched & (to_texels(task.view, np.ones(PIXELS)) < 2)
-    assert errors[evidence.known & ~rim].max() <= 2
+    assert errors[evidence.known & (shown > 2)].max() <= 2  # measured 0.004
 
 
 def test_any_start_leads_to_the_same_map():
-    study, task, fit = relief_fit("relief")
+    study, task, fit = relief_fit()
     slopes = np.random.default_rng(0).normal(size=(SIDE, SIDE, 2))
     other = finished(
         MapFit(task, study.shading, study.lights, slopes=jnp.asarray(slopes, jnp.float32))
     )
     assert errors_of(study, other.start.slopes).mean() > 10
-    assert errors_of(study, other.unknowns.slopes).max() <= 0.05  # measured 0.001
+    known = gather_evidence(task, fit.unknowns).known
+    assert errors_of(study, other.unknowns.slopes)[known].max() <= 0.05  # measured 0.005
     normals = [np.asarray(normals_from_slopes(f.unknowns.slopes)) for f in (fit, other)]
-    assert angles(*normals).max() <= 0.05
+    assert angles(*normals)[known].max() <= 0.05  # measured 0.007
 
 
 def test_a_fit_that_starts_at_the_truth_is_done():
-    study, task, _ = relief_fit("relief")
+    study, task, _ = relief_fit()
     slopes, _ = slopes_from_normals(study.truth.astype(np.float32))
     fit = MapFit(task, study.shading, study.lights, slopes=slopes)
     fit.advance(50)
@@ -177,7 +163,7 @@ def test_a_fit_that_starts_at_the_truth_is_done():
 
 
 def test_pixels_in_shadow_do_not_pull():
-    study, task, fit = relief_fit("shadowed-relief")
+    study, task, fit = relief_fit()
     rng = np.random.default_rng(0)
     wild = rng.choice(np.float32([-1e6, -3, 0, 50, 1e6]), task.targets.shape)
     dark = np.asarray(task.view.lit)[:, None] == 0
@@ -228,18 +214,23 @@ def test_colored_lights_of_all_kinds_on_a_colored_texture_give_the_map(name):
     evidence = gather_evidence(task, fit.unknowns)
     errors = map_errors(fit, hills())
     assert evidence.known.mean() > 0.9
-    assert errors[evidence.known].mean() <= 0.01  # measured CM
-    assert errors[evidence.known].max() <= 2  # measured CX
+    assert errors[evidence.known].mean() <= 0.01  # measured 0.0010
+    assert errors[evidence.known].max() <= 2  # measured 0.004
 
 
 GLOSSY = PhongShading(albedo=0.5, specular=0.4, shininess=2.0)
+MATTE = LambertShading(albedo=0.5, ambient=0.05)
+JOINT = {
+    "material and directions": (GLOSSY, ("albedo", "specular", "light.direction"), 0.01),
+    "colors": (MATTE, ("light.color",), 0.001),
+}
 
 
-@functools.cache
-def joint_fit(*names):
-    """Return a fit that starts from wrong numbers of the names, and the truth."""
+def begin(case):
+    """Return a task and a fit that starts from wrong numbers, all those that are free."""
     rng = np.random.default_rng(3)
-    model, lights = GLOSSY, list(LAMPS)
+    model, names, _ = JOINT[case]
+    start, lights = model, list(LAMPS)
     for name in names:
         if name.startswith("light."):
             field = name.removeprefix("light.")
@@ -249,22 +240,22 @@ def joint_fit(*names):
                     value = unit(*value)
                 lights[k] = dataclasses.replace(light, **{field: value})
         else:
-            model = dataclasses.replace(model, **{name: getattr(model, name) * 1.4})
-    with jax.enable_x64(False):
-        task = studio_task(GLOSSY, LAMPS)
-        fit = finished(MapFit(task, model, lights, free=names), 1000)
-        return task, fit, Unknowns(hills(), GLOSSY, LAMPS)
+            start = dataclasses.replace(start, **{name: getattr(start, name) * 1.4})
+    task = studio_task(model, LAMPS)
+    return task, MapFit(task, start, lights, free=names)
 
 
-@pytest.mark.parametrize(
-    ("names", "tolerance"),
-    [
-        (("albedo", "specular"), 0.002),  # measured AS
-        (("light.direction", "light.color"), 0.01),  # measured LD
-    ],
-)
-def test_numbers_are_recovered_beside_the_map(names, tolerance):
-    task, fit, truth = joint_fit(*names)
+@functools.cache
+def joint_fit(case):
+    task, fit = begin(case)
+    return task, finished(fit, 1000)
+
+
+@pytest.mark.parametrize("case", JOINT)
+def test_numbers_are_recovered_beside_the_map(case):
+    model, names, tolerance = JOINT[case]
+    task, fit = joint_fit(case)
+    truth = Unknowns(hills(), model, LAMPS)
     labels = []
     for label, where in free_leaves(truth, names):
         start, found, true = (np.asarray(where(u)) for u in (fit.start, fit.unknowns, truth))
@@ -272,20 +263,22 @@ def test_numbers_are_recovered_beside_the_map(names, tolerance):
         np.testing.assert_allclose(found, true, atol=tolerance)
         labels.append(label)
     assert len(labels) == sum(3 if name.startswith("light.") else 1 for name in names)
-    assert map_errors(fit, truth.slopes).mean() <= 0.5  # measured MJ
+    assert map_errors(fit, truth.slopes).mean() <= 0.5  # measured 0.0009
     assert undetermined(task, fit.unknowns, names) == []
 
 
 def test_what_is_not_free_stays_to_the_bit():
-    _, fit, _ = joint_fit("albedo", "specular")
-    names = ["ambient", "shininess", "light.direction", "light.color"]
-    for label, where in free_leaves(fit.start, names):
-        found, start = (np.asarray(where(u)) for u in (fit.unknowns, fit.start))
-        assert_close(found, start, ulps=0 if "direction" not in label else 2)
+    for case, fixed in (("material and directions", GLOSSY), ("colors", MATTE)):
+        _, fit = joint_fit(case)
+        names = set(free_names(fixed, LAMPS)) - set(JOINT[case][1])
+        assert len(names) == 3
+        for label, where in free_leaves(fit.start, sorted(names)):
+            found, start = (np.asarray(where(u)) for u in (fit.unknowns, fit.start))
+            assert_close(found, start, ulps=2 if label.endswith("direction") else 0)
 
 
 def test_directions_keep_unit_length():
-    _, fit, _ = joint_fit("light.direction", "light.color")
+    _, fit = joint_fit("material and directions")
     for light in fit.unknowns.lights:
         assert float(np.linalg.norm(light.direction)) == pytest.approx(1, abs=1e-6)
 
@@ -324,30 +317,27 @@ def test_names_are_those_of_the_model_and_of_its_lights():
 
 def test_a_fit_stopped_and_continued_is_that_of_one_that_never_was(tmp_path):
     """Across two anchors, with numbers free beside the map."""
-    names = ("albedo", "specular")
-    task = studio_task(GLOSSY, LAMPS)
-    begin = lambda: MapFit(task, PhongShading(0.7, 0.6, 2.0), LAMPS, free=names)
-    unstopped, stopped = begin(), begin()
-    unstopped.advance(40)
-    assert unstopped.steps == 40
-    for steps in (13, 17):
+    (_, unstopped), (_, stopped) = begin("colors"), begin("colors")
+    unstopped.advance(30)
+    assert unstopped.steps == 30
+    for steps in (13, 12):
         stopped.advance(steps)
         stopped.store(tmp_path / "state.eqx")
-        stopped = begin()
+        _, stopped = begin("colors")
         stopped.restore(tmp_path / "state.eqx")
-    assert stopped.steps == 30
-    stopped.advance(10)
+    assert stopped.steps == 25
+    stopped.advance(5)
+    assert stopped.steps == unstopped.steps
     for found, expected in zip(
         jax.tree.leaves(stopped.unknowns), jax.tree.leaves(unstopped.unknowns), strict=True
     ):
         np.testing.assert_array_equal(found, expected)
-    assert stopped.steps == unstopped.steps
 
 
 def test_the_state_of_a_fit_of_other_numbers_is_refused(tmp_path):
-    task, fit, _ = joint_fit("albedo", "specular")
+    task, fit = joint_fit("colors")
     fit.store(tmp_path / "state.eqx")
-    other = MapFit(task, GLOSSY, LAMPS, free=("albedo",))
+    other = MapFit(task, MATTE, LAMPS, free=("albedo",))
     before = np.asarray(other.unknowns.slopes)
     with pytest.raises(ValueError, match=r"state\.eqx: cannot be continued from"):
         other.restore(tmp_path / "state.eqx")
@@ -362,33 +352,31 @@ def test_the_objective_is_traced_once_whatever_the_steps(monkeypatch):
         return objective(*args)
 
     monkeypatch.setattr(experiments.fit_normal_map, "objective", counted)
-    names = ("albedo", "specular")
-    fit = MapFit(studio_task(GLOSSY, LAMPS), PhongShading(0.7, 0.6, 2.0), LAMPS, free=names)
+    _, fit = begin("colors")
     fit.advance(1)
     assert fit.converged is False
     once = len(traces)
     assert once > 0
-    for steps in (1, 5, 30):  # over an anchor
+    for steps in (1, 5, 20):  # over an anchor
         fit.advance(steps)
-    assert fit.steps == 37
+    assert fit.steps == 27
     assert len(traces) == once
 
 
 def test_what_is_left_of_the_loss_is_the_noise():
-    _, task, fit = relief_fit("relief", 0.01)
+    _, task, fit = relief_fit(0.01)
     value = quick(lambda task, unknowns: jnp.sum(jnp.stack(task.residuals(unknowns)) ** 2))
     before, after = (float(value(task, u)) for u in (fit.start, fit.unknowns))
     assert after < 0.01 * before
     residuals = float(np.asarray(task.view.lit).sum()) * 3
-    assert after == pytest.approx(1e-4 * (residuals - 2 * SIDE**2), rel=0.05)  # measured LO
+    assert after == pytest.approx(1e-4 * (residuals - 2 * SIDE**2), rel=0.05)  # measured 0.003
 
 
 # Studies
 
 
 def test_made_images_are_those_of_the_map_and_dark_where_a_caster_hides_the_light():
-    study = relief_study("shadowed-relief")
-    clean = relief_study("relief")
+    study = relief_study()
     assert len(study.images) == len(study.lights) == 6
     for image, visibility, values in zip(
         study.images, study.seen.visibility, np.asarray(study.targets), strict=True
@@ -399,21 +387,20 @@ def test_made_images_are_those_of_the_map_and_dark_where_a_caster_hides_the_ligh
         np.testing.assert_array_equal(image[inside].T, values)
         np.testing.assert_allclose(image[inside & ~visibility], 0.1, rtol=1e-6)  # ambient
         assert image[inside & visibility].min() > 0.1
-    assert clean.seen.visibility[:, clean.seen.inside].all()
 
 
 def test_noise_is_as_strong_as_told_and_the_same_every_time():
-    clean, noisy = relief_study("relief"), relief_study("relief", 0.01)
+    clean, noisy = relief_study(), relief_study(0.01)
     difference = np.asarray(noisy.targets) - np.asarray(clean.targets)
     assert difference.std() == pytest.approx(0.01, rel=0.02)
     assert abs(difference.mean()) < 1e-4
-    again = make_study(prepared("relief"), PhongShading(), image_size=IMAGE, noise=0.01)
+    again = make_study(prepared(), PhongShading(), image_size=IMAGE, noise=0.01)
     np.testing.assert_array_equal(again.targets, noisy.targets)
 
 
 def test_the_truth_is_the_map_and_errors_are_angles_to_it():
-    study = relief_study("relief")
-    texels = relief(size=SIDE).materials[0].normal_texture.texels
+    study = relief_study()
+    texels = shadowed_relief(size=SIDE).materials[0].normal_texture.texels
     np.testing.assert_allclose(study.truth, 2.0 * texels - 1, atol=1e-6)
     slopes, _ = slopes_from_normals(study.truth.astype(np.float32))
     assert errors_of(study, slopes).max() < 1e-4
@@ -432,10 +419,10 @@ def test_angles_are_exact_from_nothing_to_opposite():
 
 def test_a_scale_of_the_map_counts():
     """The truth is what the renderer shows, also where the material weakens its map."""
-    scene = relief(size=SIDE)
+    scene = shadowed_relief(size=SIDE)
     look = dataclasses.replace(scene.materials[0], normal_scale=0.5)
     study = make_study(
-        prepare_scene(scene._replace(materials=(look,)), tangents=True),
+        prepare_scene(scene._replace(materials=(look, scene.materials[1])), tangents=True),
         PhongShading(),
         image_size=IMAGE,
     )
@@ -446,34 +433,35 @@ def test_a_scale_of_the_map_counts():
 
 
 def test_given_images_are_taken_as_they_are():
-    study = relief_study("relief")
-    given = load_study(prepared("relief"), PhongShading(), study.images[:4], shadow_margin=0)
+    study = relief_study()
+    given = load_study(prepared(), PhongShading(), study.images[:4], shadow_margin=0)
     assert isinstance(given, MapStudy)
     assert given.truth is None
     assert len(given.lights) == 4
     np.testing.assert_array_equal(given.targets, study.targets[:4])
     np.testing.assert_array_equal(given.seen.view.lit, study.seen.view.lit[:4])
     assert given.seen.view.map_size == (SIDE, SIDE)
-    other = load_study(prepared("relief"), PhongShading(), study.images[:1], map_size=(5, 7))
+    other = load_study(prepared(), PhongShading(), study.images[:1], map_size=(5, 7))
     assert other.seen.view.map_size == (5, 7)
     assert int(other.seen.view.indices.max()) < 35
 
 
 def test_pixels_that_the_format_cuts_off_do_not_count():
-    study = relief_study("relief")
+    study = relief_study()
     cut = [np.minimum(image, 1.0) for image in study.images[:2]]
-    given = load_study(prepared("relief"), PhongShading(), cut, limit=1.0, shadow_margin=0)
+    given = load_study(prepared(), PhongShading(), cut, limit=1.0, shadow_margin=0)
     bright = np.stack([image[study.seen.inside].max(axis=-1) >= 1 for image in study.images[:2]])
     assert 0.05 < bright.mean() < 0.9
     lit = np.asarray(given.seen.view.lit, bool)
     assert not lit[bright].any()
-    assert lit[~bright].mean() > 0.98  # all but those within one 8-bit level of white
+    before = np.asarray(study.seen.view.lit[:2], bool)
+    assert lit[before & ~bright].mean() > 0.98  # all but those within one 8-bit level of white
 
 
 BAD = {
     "more images than lights": (
         lambda images: [*images, images[0]],
-        "--images: got 7 images, but relief has 6",
+        "--images: got 7 images, but shadowed-relief has 6",
     ),
     "sizes": (
         lambda images: [images[0], images[1][:, :-2]],
@@ -493,33 +481,34 @@ BAD = {
 @pytest.mark.parametrize("flaw", BAD)
 def test_images_that_cannot_be_used_are_refused(flaw):
     change, says = BAD[flaw]
-    images = change(list(relief_study("relief").images))
+    images = change(list(relief_study().images))
     with pytest.raises(ValueError, match=says) as refusal:
-        load_study(prepared("relief"), PhongShading(), images)
+        load_study(prepared(), PhongShading(), images)
     assert "\n" not in str(refusal.value)
 
 
 def test_a_scene_without_a_map_has_no_images_to_make():
-    scene = prepared("relief")
-    bare = scene._replace(materials=(dataclasses.replace(scene.materials[0], normal_texture=None),))
+    scene = prepared()
+    look = dataclasses.replace(scene.materials[0], normal_texture=None)
+    bare = scene._replace(materials=(look, scene.materials[1]))
     with pytest.raises(
-        ValueError, match=r"relief: has no normal map to make images from; .*--images"
+        ValueError, match=r"shadowed-relief: has no normal map to make images from; .*--images"
     ):
         make_study(bare, PhongShading(), image_size=IMAGE)
 
 
 def test_a_map_that_looks_down_is_refused():
-    scene = relief(size=SIDE)
+    scene = shadowed_relief(size=SIDE)
     texels = scene.materials[0].normal_texture.texels.copy()
     texels[3, 4] = [0.5, 0.6, 0.1]
     look = dataclasses.replace(scene.materials[0], normal_texture=Texture(texels, clamp, clamp))
-    scene = prepare_scene(scene._replace(materials=(look,)), tangents=True)
+    scene = prepare_scene(scene._replace(materials=(look, scene.materials[1])), tangents=True)
     with pytest.raises(ValueError, match="relief: its normal map has normals that do not look up"):
         make_study(scene, PhongShading(), image_size=IMAGE)
 
 
 def test_the_mapped_material_is_the_first_with_a_map():
-    scene = relief(size=SIDE)
+    scene = shadowed_relief(size=SIDE)
     plain = dataclasses.replace(scene.materials[0], normal_texture=None)
     assert mapped_material(scene._replace(materials=(plain, plain, scene.materials[0]))) == 2
     assert mapped_material(scene._replace(materials=(plain, plain))) == 0

@@ -231,7 +231,7 @@ def test_a_margin_takes_the_edges_of_shadows_away_and_nothing_else(margin):
     covered = seen().surface.face_ids >= 0
     square = np.ones((2 * margin + 1, 2 * margin + 1))
     for seen_light, lit in zip(seen().visibility, seen(margin).view.lit, strict=True):
-        near_dark = ndimage.binary_dilation(covered & ~seen_light, square)
+        near_dark = np.asarray(ndimage.binary_dilation(covered & ~seen_light, square), bool)
         expected = (seen_light & ~near_dark)[seen().inside]
         assert 0 < expected.sum() < seen_light[seen().inside].sum()
         np.testing.assert_array_equal(np.asarray(lit, bool), expected)
@@ -289,7 +289,7 @@ def derivatives():
         point = double(Unknowns(jnp.asarray(rng.normal(scale=0.4, size=(5, 6, 2))), model, LIGHTS))
         step = jax.tree.map(lambda a: jnp.asarray(rng.normal(size=np.shape(a))), point)
 
-        @jax.jit
+        @quick
         def both(point, step):
             residuals = lambda u: jnp.concatenate(Task(view, targets).residuals(u))
             value, along = jax.jvp(residuals, (point,), (step,))
