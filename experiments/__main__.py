@@ -12,6 +12,7 @@ from rich.text import Text
 from .console import say_error
 
 _PROGRAM = "python -m experiments"
+_WITH_WORDS = ("--bias", "--filter", "--compare", "--shading")
 
 
 def main() -> int:
@@ -67,10 +68,11 @@ def _parse(
     """
     import tyro
 
-    from .options import hint
+    from .options import hint, join_options
 
     if arguments and not arguments[0].startswith("-") and arguments[0] not in commands:
         raise ValueError(f"no such command '{arguments[0]}'; {hint(arguments[0], commands)}")
+    arguments = join_options(arguments, _WITH_WORDS)
     later = {name: _later(command) for name, command in commands.items()}
     box = io.StringIO()
     try:

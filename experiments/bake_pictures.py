@@ -12,10 +12,10 @@ from jaxtyping import Bool, Float
 from shadows.appearance import Appearance
 from shadows.bias import SlopeBias
 from shadows.compare import HardCompare
-from shadows.filters import BilinearFilter
 from shadows.interpolate import interpolate
 from shadows.render import Rendering
 from shadows.surface import Surface
+from shadows.window_filters import BilinearFilter
 from tangentspace.material import Material
 from tangentspace.mesh import Mesh
 from tangentspace.mikktspace import with_tangents

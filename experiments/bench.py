@@ -18,11 +18,11 @@ import tyro
 
 from shadows.bias import CombinedBias, ConstantBias, SlopeBias
 from shadows.compare import SoftCompare
-from shadows.filters import BilinearFilter
 from shadows.lights import Light
 from shadows.rasterize import rasterize
 from shadows.render import Rendering, render
 from shadows.transforms import Camera, transform_points
+from shadows.window_filters import BilinearFilter
 from tangentspace.mesh import Mesh
 from tangentspace.shading import BlinnPhongShading
 from tangentspace.shapes import icosphere, merge, plane, transform_mesh

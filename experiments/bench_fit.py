@@ -13,7 +13,7 @@ import numpy as np
 import tyro
 
 from shadows.bias import CombinedBias, ConstantBias, SlopeBias
-from shadows.filters import BilinearFilter
+from shadows.window_filters import BilinearFilter
 from tangentspace.shading import BlinnPhongShading
 
 from .bias_study import prepare_study

@@ -1,7 +1,7 @@
 """One view under one light, prepared for trying biases: nothing is rasterized again.
 
 The two passes, the places of all pixels in the map and, for biases that act on depth
-alone, the texels that they ask are computed once. A trial is then a comparison per pixel.
+alone, what the filter reads there are computed once. A trial is then a comparison per pixel.
 Pixels turned away from the light are dark whatever the bias, so they are left out.
 """
 
@@ -12,11 +12,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from shadows.bias import Bias, CombinedBias
 from shadows.compare import Compare, HardCompare
-from shadows.filters import Filter, Tap, compare_taps, look_up
+from shadows.filters import Filter, look_up
 from shadows.render import Rendering, receive_surface
 from shadows.shadow_map import Receiver, ShadowMap
 from tangentspace._math import dot
@@ -100,22 +100,23 @@ class Trial(NamedTuple):
 
     Attributes:
         receiver: The pixels in the map, without bias.
-        taps: What the filter reads there while the texel does not move.
-        shadow_map: For biases that move the texel.
+        reading: What the filter reads there while no texel moves.
+        shadow_map: For biases and filters that read anew.
         goal: What visibility is compared with.
     """
 
     receiver: Receiver
-    taps: tuple[Tap, ...]
+    reading: PyTree
     shadow_map: ShadowMap
     goal: Goal
 
     def visibility(self, bias: Bias, filter: Filter, compare: Compare) -> Float[Array, " pixels"]:
         """Return the visibility of the facing pixels under a bias."""
-        receiver = bias(self.receiver)
-        if bias.moves_texel:
-            return look_up(self.shadow_map, receiver, filter=filter, compare=compare)
-        return compare_taps(self.taps, receiver, compare)
+        receiver = bias(self.receiver, filter.reach())
+        if bias.reads_anew or filter.reads_anew:
+            shadow_map = bias.prepare(self.shadow_map)
+            return look_up(shadow_map, receiver, filter=filter, compare=compare)
+        return filter.visibility(self.reading, receiver, compare)
 
     def error(self, bias: Bias, filter: Filter) -> Float[Array, ""]:
         """Return the goal's error under hard comparison."""
@@ -134,7 +135,7 @@ class Study(NamedTuple):
     Attributes:
         scene: What is seen.
         unbiased: The view with zero bias, with both passes.
-        filter: Which texels are asked.
+        filter: How the map is asked.
         shading: How the pictures are lit.
         truth: Ray-traced visibility.
         occluder_distance: World length along the ray to what hides the light; inf if lit.
@@ -201,7 +202,7 @@ def prepare_study(
     map_size: int,
     filter: Filter,
     shading: Shading,
-    cull_front: bool = False,
+    bias: CombinedBias = CombinedBias(),
 ) -> Study:
     """Make both passes and trace the truth; the goal is that truth.
 
@@ -209,9 +210,9 @@ def prepare_study(
         scene: What is seen; its first light counts.
         image_size: Height and width in pixels.
         map_size: Texels on each side of the shadow map.
-        filter: Which texels are asked.
+        filter: How the map is asked.
         shading: The lighting model of the pictures.
-        cull_front: Draw only faces turned away from the light into the map.
+        bias: What will be tried; says which surfaces cast.
 
     Raises:
         ValueError: If nothing that is seen faces the light, or nothing is in its view.
@@ -221,15 +222,15 @@ def prepare_study(
         scene,
         image_size=image_size,
         map_size=map_size,
-        bias=CombinedBias(),
+        bias=CombinedBias(tuple(term for term in bias.terms if term.casters != "nearest")),
         filter=filter,
         compare=HardCompare(),
         shading=shading,
-        cull_front=cull_front,
     )
     light, surface, shadow_map = scene.lights[0], unbiased.surface, unbiased.shadow_maps[0]
-    check_shadow_map(scene, shadow_map, cull_front=cull_front)
-    receiver = jax.jit(receive_surface)(surface, light, shadow_map)
+    check_shadow_map(scene, shadow_map, casters=bias.casters)
+    reach = filter.reach()
+    receiver = jax.jit(receive_surface)(surface, light, shadow_map, reach=reach)
     facing = np.asarray(surface.covered & (dot(receiver.normal, receiver.to_light) > 0))
     if not facing.any():
         raise ValueError(f"{scene.name}: no visible surface faces the light; move light or camera")
@@ -239,14 +240,22 @@ def prepare_study(
     truth = trace_visibility(position, normal, face_ids, light, occluders)
     distance = nearest_occluder_distance(position, normal, face_ids, light, occluders)
 
-    at_pixels = Receiver._make(
-        [*(jnp.asarray(np.asarray(v)[facing]) for v in receiver[:-1]), receiver.texel_from_world]
-    )
+    at_pixels = _at_pixels(receiver, facing)
     goal = TruthGoal(
         jnp.asarray(truth[facing], jnp.float32), jnp.sum(surface.covered).astype(jnp.float32)
     )
-    trial = Trial(at_pixels, filter.taps(shadow_map, at_pixels), shadow_map, goal)
+    reading = filter.read(filter.prepare(bias.prepare(shadow_map)), at_pixels)
+    trial = Trial(at_pixels, reading, shadow_map, goal)
     return Study(scene, unbiased, filter, shading, truth, distance, facing, trial)
+
+
+def _at_pixels(receiver: Receiver, chosen: Bool[np.ndarray, "height width"]) -> Receiver:
+    """Return the receivers of some pixels."""
+    shared = {"texel_from_world": receiver.texel_from_world}
+    kept = receiver._replace(texel_from_world=None)
+    return jax.tree.map(lambda values: jnp.asarray(np.asarray(values)[chosen]), kept)._replace(
+        **shared
+    )
 
 
 def with_target(

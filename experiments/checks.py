@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from shadows.lights import DirectionalLight, Light, PointLight, SpotLight
-from shadows.shadow_map import ShadowMap
+from shadows.shadow_map import Casters, ShadowMap
 from shadows.transforms import transform_points
 
 from .scene import Scene
@@ -89,9 +89,9 @@ def check_scene(scene: Scene) -> None:
         raise ValueError(f"{scene.name}: nothing is in the light's view; move or turn the light")
 
 
-def check_shadow_map(scene: Scene, shadow_map: ShadowMap, *, cull_front: bool) -> None:
+def check_shadow_map(scene: Scene, shadow_map: ShadowMap, *, casters: Casters) -> None:
     """Refuse an empty map, but for one that shows only faces turned away from the light."""
-    if not cull_front and not bool((shadow_map.depth < 1).any()):
+    if casters != "back" and not bool((shadow_map.depth < 1).any()):
         raise ValueError(f"{scene.name}: nothing is in the light's view; move or turn the light")
 
 

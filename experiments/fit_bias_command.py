@@ -10,7 +10,6 @@ import numpy as np
 import tyro
 
 from shadows.bias import Bias, CombinedBias
-from shadows.filters import Filter
 
 from .bias_space import free_numbers
 from .bias_study import Study, TruthGoal, prepare_study, with_target
@@ -20,18 +19,18 @@ from .figures import error_picture, on_background, save_comparison, save_curve
 from .fit_bias import BiasFit, fit_bias
 from .images import atomic_path, read_image, write_exr, write_png
 from .metrics import ShadowErrors
-from .options import parse_technique, parse_techniques
+from .options import parse_techniques
 from .prepare_scene import prepare_scene
 from .provenance import commit, device, versions
 from .render_command import (
     BiasWords,
-    CullFront,
-    FilterWord,
+    FilterWords,
     ImageSize,
     MapSize,
     SceneName,
     ShadingWords,
     image_channels,
+    parse_lookup,
     parse_shading,
     shadow_map_channels,
 )
@@ -68,10 +67,9 @@ def fit(
             help_behavior_hint="(default: all)",
         ),
     ] = (),
-    filter: FilterWord = "bilinear",
+    filter: FilterWords = ("bilinear",),
     image_size: ImageSize = (512, 512),
     shadow_map_size: MapSize = 1024,
-    cull_front: CullFront = False,
     shading: ShadingWords = ("blinn-phong",),
 ) -> None:
     """Fit a shadow bias so that acne and leaks are least, and compare with a full sweep.
@@ -86,7 +84,7 @@ def fit(
     check_size("--shadow-map-size", shadow_map_size)
     terms = CombinedBias(parse_techniques(Bias, bias, option="--bias"))
     free_numbers(terms, free or None)
-    lookup = parse_technique(Filter, filter, option="--filter")
+    lookup, _ = parse_lookup(terms, filter, ())
     model = parse_shading(shading)
     goal = None if target is None else read_image(target)
     if goal is not None and target is not None:
@@ -100,9 +98,9 @@ def fit(
             loaded,
             image_size=image_size,
             map_size=shadow_map_size,
+            bias=terms,
             filter=lookup,
             shading=model,
-            cull_front=cull_front,
         )
         if goal is not None and target is not None:
             limit = 1.0 if target.suffix.lower() == ".png" else np.inf
@@ -126,8 +124,8 @@ def fit(
         _write_curve(study, fitted, errors, out)
     settings = {
         "scene": scene, "target": None if target is None else str(target), "bias": list(bias),
-        "filter": filter, "image_size": list(image_size), "shadow_map_size": shadow_map_size,
-        "cull_front": cull_front, "shading": list(shading),
+        "filter": list(filter), "image_size": list(image_size), "shadow_map_size": shadow_map_size,
+        "shading": list(shading),
     }  # fmt: skip
     summary = _summary(study, biases, errors, fitted, swept)
     _write_json(out / "summary.json", {"settings": settings, **summary, **_made_with()})

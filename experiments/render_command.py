@@ -11,7 +11,7 @@ from jaxtyping import Array
 from shadows.bias import Bias, CombinedBias
 from shadows.compare import Compare
 from shadows.filters import Filter
-from shadows.render import Rendering
+from shadows.render import Rendering, check_techniques
 from shadows.shadow_map import ShadowMap
 from tangentspace.shading import Shading
 
@@ -42,15 +42,22 @@ BiasWords = Annotated[
         help="Biases, one after another; no word for no bias. " + "; ".join(describe(Bias)) + ".",
     ),
 ]
-CompareWord = Annotated[
-    str,
-    tyro.conf.arg(metavar="NAME[=VALUE]", help="Comparison. " + "; ".join(describe(Compare)) + "."),
+CompareWords = Annotated[
+    tuple[str, ...],
+    tyro.conf.arg(
+        metavar="NAME[=VALUE]",
+        help="Comparison, for filters that compare. " + "; ".join(describe(Compare)) + ".",
+        help_behavior_hint="(default: hard)",
+    ),
 ]
-FilterWord = Annotated[
-    str, tyro.conf.arg(metavar="NAME", help="Lookup. " + "; ".join(describe(Filter)) + ".")
-]
-CullFront = Annotated[
-    bool, tyro.conf.arg(help="Draw only faces turned away from the light into the shadow map.")
+FilterWords = Annotated[
+    tuple[str, ...],
+    tyro.conf.arg(
+        metavar="NAME[.OPTION=VALUE]",
+        help="Lookup; its options also as --filter.OPTION VALUE. "
+        + "; ".join(describe(Filter))
+        + ".",
+    ),
 ]
 MapFile = Annotated[
     Path | None,
@@ -83,9 +90,8 @@ def render(
     image_size: ImageSize = (512, 512),
     shadow_map_size: MapSize = 1024,
     bias: BiasWords = ("slope=2",),
-    compare: CompareWord = "hard",
-    filter: FilterWord = "bilinear",
-    cull_front: CullFront = False,
+    compare: CompareWords = (),
+    filter: FilterWords = ("bilinear",),
     shading: ShadingWords = ("blinn-phong",),
     normal_map: MapFile = None,
     flip_green: Annotated[
@@ -132,8 +138,7 @@ def render(
     check_size("--image-size", *image_size)
     check_size("--shadow-map-size", shadow_map_size)
     terms = CombinedBias(parse_techniques(Bias, bias, option="--bias"))
-    comparison = parse_technique(Compare, compare, option="--compare", least=0.0)
-    lookup = parse_technique(Filter, filter, option="--filter")
+    lookup, comparison = parse_lookup(terms, filter, compare)
     model = parse_shading(shading)
     if reflectivity is not None and not 0 <= reflectivity <= 1:
         raise ValueError(f"--reflectivity: expected a share from 0 to 1, got {reflectivity}")
@@ -167,10 +172,9 @@ def render(
             filter=lookup,
             compare=comparison,
             shading=model,
-            cull_front=cull_front,
         )
     for shadow_map in image.shadow_maps:
-        check_shadow_map(loaded, shadow_map, cull_front=cull_front)
+        check_shadow_map(loaded, shadow_map, casters=terms.casters)
     covered = np.asarray(image.surface.covered)
     if not covered.any():
         say_notes(["the camera sees no surface; the image is empty"])
@@ -187,16 +191,28 @@ def render(
             say(f"wrote {path}")
 
 
+def parse_lookup(
+    bias: CombinedBias, filter: Sequence[str], compare: Sequence[str]
+) -> tuple[Filter, Compare]:
+    """Make the filter and the comparison that ``--filter`` and ``--compare`` name.
+
+    Raises:
+        ValueError: If they are not understood, or mean nothing to each other or to the bias.
+    """
+    lookup = parse_technique(Filter, filter, option="--filter")
+    if compare and not lookup.compares:
+        raise ValueError(f"--compare: --filter {filter[0]} compares no depths; drop one of them")
+    check_techniques(bias, lookup)
+    return lookup, parse_technique(Compare, compare or ["hard"], option="--compare", least=0.0)
+
+
 def parse_shading(words: Sequence[str]) -> Shading:
     """Make the lighting model that the words of ``--shading`` name.
 
     Raises:
         ValueError: If they name none, or several, or are not understood.
     """
-    models = parse_techniques(Shading, words, option="--shading")
-    if len(models) != 1:
-        raise ValueError(f"--shading: expected one lighting model, got {len(models)}; name one")
-    return models[0]
+    return parse_technique(Shading, words, option="--shading")
 
 
 def image_channels(image: Rendering) -> Channels:

@@ -30,7 +30,6 @@ def render_scene(
     filter: Filter,
     compare: Compare,
     shading: Shading,
-    cull_front: bool = False,
 ) -> Rendering:
     """Render a scene under all its lights; compiled once per set of sizes and techniques.
 
@@ -38,15 +37,14 @@ def render_scene(
         scene: As ``prepare_scene`` returns it.
         image_size: Height and width in pixels.
         map_size: Texels on each side of the shadow maps.
-        bias: Against self-shadowing.
-        filter: Which texels are asked.
-        compare: Hard or soft.
+        bias: Against self-shadowing; says which surfaces cast.
+        filter: How the maps are asked.
+        compare: Hard or soft; for filters that compare.
         shading: The lighting model.
-        cull_front: Draw only faces turned away from the light into the maps.
     """
     look = (scene.materials, scene.face_materials, scene.environment)
-    arrays = (scene.mesh, scene.camera, scene.lights, look, bias, compare, shading)
-    static = (image_size, map_size, filter, cull_front)
+    arrays = (scene.mesh, scene.camera, scene.lights, look, bias, filter, compare, shading)
+    static = (image_size, map_size)
     return jax.block_until_ready(_render(jax.tree.map(jnp.asarray, arrays), static))
 
 
@@ -65,16 +63,15 @@ def shade_scene(
 
 @eqx.filter_jit
 def _render(arrays: tuple, static: tuple) -> Rendering:
-    mesh, camera, lights, look, bias, compare, shading = arrays
+    mesh, camera, lights, look, bias, filter, compare, shading = arrays
     materials, face_materials, environment = look
-    image_size, map_size, filter, cull_front = static
+    image_size, map_size = static
     return render(
         mesh,
         camera,
         lights,
         image_size=image_size,
         map_size=map_size,
-        cull_front=cull_front,
         bias=bias,
         filter=filter,
         compare=compare,

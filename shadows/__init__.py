@@ -2,6 +2,7 @@
 
 from .appearance import Appearance as Appearance
 from .appearance import surface_appearance as surface_appearance
+from .bias import AnalyticBias as AnalyticBias
 from .bias import Bias as Bias
 from .bias import CombinedBias as CombinedBias
 from .bias import ConstantBias as ConstantBias
@@ -10,10 +11,10 @@ from .bias import SlopeBias as SlopeBias
 from .compare import Compare as Compare
 from .compare import HardCompare as HardCompare
 from .compare import SoftCompare as SoftCompare
-from .filters import BilinearFilter as BilinearFilter
 from .filters import Filter as Filter
 from .filters import NearestFilter as NearestFilter
 from .filters import Tap as Tap
+from .filters import TapFilter as TapFilter
 from .filters import compare_taps as compare_taps
 from .filters import look_up as look_up
 from .interpolate import barycentric_slopes as barycentric_slopes
@@ -21,19 +22,28 @@ from .interpolate import barycentrics as barycentrics
 from .interpolate import gather_faces as gather_faces
 from .interpolate import interpolate as interpolate
 from .interpolate import window_depth as window_depth
+from .layer_bias import FrontFaceCullingBias as FrontFaceCullingBias
+from .layer_bias import MidpointBias as MidpointBias
+from .layer_bias import SecondDepthBias as SecondDepthBias
 from .lights import DirectionalLight as DirectionalLight
 from .lights import Light as Light
 from .lights import PointLight as PointLight
 from .lights import SpotLight as SpotLight
+from .plane_bias import AdaptiveBias as AdaptiveBias
+from .plane_bias import ReceiverPlaneBias as ReceiverPlaneBias
 from .rasterize import Raster as Raster
 from .rasterize import rasterize as rasterize
+from .rasterize import rasterize_two as rasterize_two
 from .render import Rendering as Rendering
+from .render import check_techniques as check_techniques
 from .render import receive_surface as receive_surface
 from .render import render as render
 from .render import shade as shade
 from .render import surface_visibility as surface_visibility
+from .shadow_map import PlaneSlope as PlaneSlope
 from .shadow_map import Receiver as Receiver
 from .shadow_map import ShadowMap as ShadowMap
+from .shadow_map import choose_map as choose_map
 from .shadow_map import receive as receive
 from .shadow_map import render_shadow_map as render_shadow_map
 from .surface import Surface as Surface
@@ -46,3 +56,7 @@ from .transforms import orthographic as orthographic
 from .transforms import perspective as perspective
 from .transforms import texel_from_clip as texel_from_clip
 from .transforms import transform_points as transform_points
+from .window_filters import BilinearFilter as BilinearFilter
+from .window_filters import PCFFilter as PCFFilter
+from .window_filters import TentFilter as TentFilter
+from .window_filters import WindowFilter as WindowFilter

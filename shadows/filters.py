@@ -1,23 +1,61 @@
-"""Filters: which texels of the map a receiver asks, and with which weights.
+"""Filters: what of the map a receiver asks, and how the answers become one visibility.
 
-Comparisons are blended, never depths (percentage-closer filtering). Outside the map's
-image, and beyond its depths, nothing is known to block, so a point there is lit; that no
-light arrives there may be the light's own affair.
+A filter works in three stages, so that nothing is computed again that stays: ``prepare``
+sees the map alone (once per light), ``read`` the map and the receivers' places (once while
+only depth biases move), ``visibility`` the receivers' depths. Outside the map's image, and
+beyond its depths, nothing is known to block, so a point there is lit; that no light
+arrives there may be the light's own affair.
 
-A new filter is a new subclass of ``Filter``.
+A new filter is a new subclass of ``Filter``, or of one of those that share a way:
+``TapFilter`` blends comparisons, never depths (percentage-closer filtering), ``window_filters``
+holds those of regular windows, ``disc_filters`` those of scattered points, and
+``moment_filter`` those that blur the map beforehand.
 """
 
 import abc
 import functools
 import operator
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from .compare import Compare
 from .shadow_map import Receiver, ShadowMap
+from .transforms import Scalar
+
+
+class Filter(eqx.Module):
+    """A way to ask a shadow map.
+
+    Attributes:
+        compares: Whether it compares depths, so that a ``Compare`` and biases that follow
+            the receiver's plane mean something to it.
+        reads_anew: Whether what it reads changes with its numbers or with a bias.
+    """
+
+    compares: ClassVar[bool] = True
+    reads_anew: ClassVar[bool] = False
+
+    @abc.abstractmethod
+    def reach(self) -> Scalar:
+        """Return the texels from a receiver to the farthest texel centre, along either axis."""
+
+    def prepare(self, shadow_map: ShadowMap) -> PyTree:
+        """Return what is read, from the map alone."""
+        return shadow_map
+
+    @abc.abstractmethod
+    def read(self, prepared: Any, receiver: Receiver) -> PyTree:
+        """Read around each receiver; its depth and bias do not matter."""
+
+    @abc.abstractmethod
+    def visibility(
+        self, reading: Any, receiver: Receiver, compare: Compare
+    ) -> Float[Array, "*points"]:
+        """Return the visibility in [0, 1] of receivers after their bias (1 = lit)."""
 
 
 class Tap(NamedTuple):
@@ -26,57 +64,51 @@ class Tap(NamedTuple):
     Attributes:
         stored: Depth of the texel; 1 outside the map.
         weight: Its weight, relative to those of the receiver's other taps.
+        across: Columns from the receiver to the texel's centre.
+        down: Rows from the receiver to the texel's centre.
     """
 
     stored: Float[Array, "*points"]
     weight: Float[Array, "*points"]
+    across: Float[Array, "*points"]
+    down: Float[Array, "*points"]
 
 
-class Filter(eqx.Module):
-    """A pattern of texels round a receiver."""
+class TapFilter(Filter):
+    """A pattern of texels round a receiver, compared one by one."""
 
     @abc.abstractmethod
-    def taps(self, shadow_map: ShadowMap, receiver: Receiver) -> tuple[Tap, ...]:
+    def read(self, prepared: ShadowMap, receiver: Receiver) -> tuple[Tap, ...]:
         """Read the map around each receiver."""
 
+    def visibility(
+        self, reading: tuple[Tap, ...], receiver: Receiver, compare: Compare
+    ) -> Float[Array, "*points"]:
+        """Return the weighted mean of the comparisons."""
+        return compare_taps(reading, receiver, compare)
 
-class NearestFilter(Filter):
+
+class NearestFilter(TapFilter):
     """The one texel that the receiver falls in.
 
     Differentiability:
         None in the receiver's position across texels; visibility jumps between them.
     """
 
-    def taps(self, shadow_map: ShadowMap, receiver: Receiver) -> tuple[Tap, ...]:
+    def reach(self) -> Scalar:
+        """Return half a texel."""
+        return 0.5
+
+    def read(self, prepared: ShadowMap, receiver: Receiver) -> tuple[Tap, ...]:
         """Read one texel."""
-        stored = _fetch(shadow_map, jnp.floor(receiver.column), jnp.floor(receiver.row))
-        return (Tap(stored, jnp.ones_like(stored)),)
-
-
-class BilinearFilter(Filter):
-    """The 2x2 texels whose centres surround the receiver, bilinear weights of the results.
-
-    As a hardware shadow sampler with linear filtering (OpenGL's ``sampler2DShadow``).
-
-    Differentiability:
-        Continuous in the receiver's position, and smooth between texel centres.
-    """
-
-    def taps(self, shadow_map: ShadowMap, receiver: Receiver) -> tuple[Tap, ...]:
-        """Read four texels."""
-        left, top = jnp.floor(receiver.column - 0.5), jnp.floor(receiver.row - 0.5)
-        right_weight, bottom_weight = receiver.column - 0.5 - left, receiver.row - 0.5 - top
-        across = ((left, 1 - right_weight), (left + 1, right_weight))
-        down = ((top, 1 - bottom_weight), (top + 1, bottom_weight))
-        return tuple(
-            Tap(_fetch(shadow_map, column, row), column_weight * row_weight)
-            for row, row_weight in down
-            for column, column_weight in across
-        )
+        column, row = jnp.floor(receiver.column), jnp.floor(receiver.row)
+        stored = fetch(prepared.depth, column, row, receiver)
+        across, down = column + 0.5 - receiver.column, row + 0.5 - receiver.row
+        return (Tap(stored, jnp.ones_like(stored), across, down),)
 
 
 def compare_taps(
-    taps: tuple[Tap, ...], receiver: Receiver, compare: Compare
+    taps: Sequence[Tap], receiver: Receiver, compare: Compare
 ) -> Float[Array, "*points"]:
     """Compare a receiver with what was read; 1 = lit.
 
@@ -89,7 +121,9 @@ def compare_taps(
         Visibility in [0, 1]; 1 where the receiver lies outside of what the map can tell.
     """
     total = functools.reduce(operator.add, (tap.weight for tap in taps))
-    weighted = (tap.weight * compare(tap.stored, receiver) for tap in taps)
+    weighted = (
+        tap.weight * compare(tap.stored, receiver.at_texel(tap.across, tap.down)) for tap in taps
+    )
     # The division is also where XLA stops fusing; without one it computes the comparison
     # again for each color channel.
     visibility = functools.reduce(operator.add, weighted) / total
@@ -104,24 +138,40 @@ def look_up(
     Args:
         shadow_map: The light's map.
         receiver: Points located in that map, after their bias.
-        filter: Which texels are asked.
-        compare: How depths become visibility.
+        filter: What is asked.
+        compare: How depths become visibility, where the filter compares.
 
     Differentiability:
         In the map's depths, the receiver's depth, bias and position, and the softness, as
         far as ``filter`` and ``compare`` have derivatives there.
     """
-    return compare_taps(filter.taps(shadow_map, receiver), receiver, compare)
+    reading = filter.read(filter.prepare(shadow_map), receiver)
+    return filter.visibility(reading, receiver, compare)
 
 
-def _fetch(
-    shadow_map: ShadowMap, column: Float[Array, "*points"], row: Float[Array, "*points"]
+def fetch(
+    image: Float[Array, "*maps map_height map_width"],
+    column: Float[Array, "*points"],
+    row: Float[Array, "*points"],
+    receiver: Receiver,
+    *,
+    outside: float = 1.0,
 ) -> Float[Array, "*points"]:
-    """Read depths at whole texel coordinates; 1 outside."""
-    height, width = shadow_map.depth.shape
+    """Read an image over the map at whole texel coordinates.
+
+    Args:
+        image: Depths, or anything else that there is for each texel.
+        column: Whole number, from the left; may lie outside.
+        row: Whole number, from the top; may lie outside.
+        receiver: Tells which of several maps is read.
+        outside: What is read outside the image.
+    """
+    height, width = image.shape[-2:]
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     index = jnp.where(inside, row, 0).astype(jnp.int32) * width + jnp.where(
         inside, column, 0
     ).astype(jnp.int32)
-    depth = shadow_map.depth.reshape(-1).at[index].get(mode="promise_in_bounds")
-    return jnp.where(inside, depth, 1.0)
+    if receiver.map_index is not None:
+        index = index + receiver.map_index * (height * width)
+    values = image.reshape(-1).at[index].get(mode="promise_in_bounds")
+    return jnp.where(inside, values, outside)

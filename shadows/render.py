@@ -20,13 +20,14 @@ from tangentspace.mesh import Mesh
 from tangentspace.shading import BlinnPhongShading, Shading
 
 from .appearance import Appearance, surface_appearance
-from .bias import Bias, SlopeBias
+from .bias import Bias, CombinedBias, SlopeBias
 from .compare import Compare, HardCompare
-from .filters import BilinearFilter, Filter, look_up
+from .filters import Filter, look_up
 from .lights import Light
-from .shadow_map import Receiver, ShadowMap, receive, render_shadow_map
+from .shadow_map import Receiver, ShadowMap, choose_map, receive, render_shadow_map
 from .surface import Surface, render_surface
-from .transforms import Camera, texel_from_clip
+from .transforms import Camera, Scalar
+from .window_filters import BilinearFilter
 
 Visibility = Float[Array, "height width"]
 
@@ -49,13 +50,22 @@ class Rendering(NamedTuple):
     shadow_maps: tuple[ShadowMap, ...]
 
 
-def receive_surface(surface: Surface, light: Light, shadow_map: ShadowMap) -> Receiver:
-    """Locate the pixels of a view in a light's shadow map."""
-    height, width = shadow_map.depth.shape
-    viewport = texel_from_clip(height, width, dtype=shadow_map.depth.dtype)
+def receive_surface(
+    surface: Surface, light: Light, shadow_map: ShadowMap, *, reach: Scalar = 0.0
+) -> Receiver:
+    """Locate the pixels of a view in a light's shadow map.
+
+    Args:
+        surface: What the eye sees.
+        light: The light.
+        shadow_map: Its map; of several images, each pixel goes to the first that holds it
+            and all that the filter reads.
+        reach: Of the filter, texels.
+    """
     to_light = light.to_light(surface.position)
-    matrix = viewport @ shadow_map.clip_from_world
-    return receive(surface.position, surface.face_normal, to_light, matrix)
+    index = choose_map(surface.position, shadow_map, reach=reach)
+    matrix = shadow_map.texel_from_world
+    return receive(surface.position, surface.face_normal, to_light, matrix, map_index=index)
 
 
 def surface_visibility(
@@ -68,10 +78,31 @@ def surface_visibility(
     compare: Compare,
 ) -> Float[Array, "height width"]:
     """Return the light's visibility at each pixel; 0 on faces turned away from the light."""
-    receiver = receive_surface(surface, light, shadow_map)
+    check_techniques(bias, filter)
+    reach = filter.reach()
+    receiver = receive_surface(surface, light, shadow_map, reach=reach)
     facing = dot(receiver.normal, receiver.to_light) > 0
-    visibility = look_up(shadow_map, bias(receiver), filter=filter, compare=compare)
+    moved = bias(receiver, reach)
+    visibility = look_up(bias.prepare(shadow_map), moved, filter=filter, compare=compare)
     return jnp.where(facing & surface.covered, visibility, 0.0)
+
+
+def check_techniques(bias: Bias, filter: Filter) -> None:
+    """Refuse a bias that means nothing to a filter.
+
+    Raises:
+        ValueError: If the bias follows the receiver's plane and the filter compares no texels.
+    """
+    if bias.follows_plane and not filter.compares:
+        raise ValueError(
+            f"bias: {_term_names(bias)} compares texel by texel, which {type(filter).__name__} "
+            "does not; choose another bias or filter"
+        )
+
+
+def _term_names(bias: Bias) -> str:
+    terms = bias.terms if isinstance(bias, CombinedBias) else (bias,)
+    return " and ".join(type(term).__name__ for term in terms if term.follows_plane)
 
 
 def shade(
@@ -125,7 +156,6 @@ def render(
     *,
     image_size: tuple[int, int] = (512, 512),
     map_size: int = 1024,
-    cull_front: bool = False,
     bias: Bias = SlopeBias(2.0),
     filter: Filter = BilinearFilter(),
     compare: Compare = HardCompare(),
@@ -144,11 +174,10 @@ def render(
         lights: One light or several.
         image_size: Height and width in pixels.
         map_size: Texels on each side of a shadow map.
-        cull_front: Draw only faces turned away from the light into the maps.
-        bias: Against self-shadowing; the default is the least that clears every plane of
-            acne under 2x2 lookup.
-        filter: Which texels are asked.
-        compare: Hard, or soft where derivatives are wanted.
+        bias: Against self-shadowing, which also says which surfaces cast; the default is the
+            least that clears every plane of acne under 2x2 lookup.
+        filter: How the maps are asked.
+        compare: Hard, or soft where derivatives are wanted; for filters that compare.
         materials: How the mesh looks; none is plain white. Height textures are not applied
             here: ``tangentspace.displace`` moves the vertices before.
         face_materials: For each face, the index of its material; not needed for one.
@@ -172,7 +201,7 @@ def render(
                 mesh.faces,
                 light.clip_from_world(mesh.positions),
                 map_size=map_size,
-                cull_front=cull_front,
+                casters=bias.casters,
             )
             for light in lights
         ]

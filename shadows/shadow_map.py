@@ -3,18 +3,23 @@
 A ``ShadowMap`` depends on the light and the geometry, not on the eye: keep it while only
 the eye or a bias moves. A ``Receiver`` holds a point's place in the map, and how the depth
 of its surface changes from texel to texel: from the plane of its face, analytically.
+
+A light that one image cannot serve has several (the faces of a cube, cascades): they lie
+along a leading axis, and each point is looked up in the first that holds it.
 """
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from tangentspace._math import dot, safe_divide
 
-from .rasterize import rasterize
-from .transforms import Scalar, transform_points
+from .rasterize import rasterize, rasterize_two
+from .transforms import Scalar, texel_from_clip, transform_points
 
 _STEEPEST = 100.0  # tangent of the angle to the light up to which slopes are followed
 
@@ -22,35 +27,52 @@ _STEEPEST = 100.0  # tangent of the angle to the light up to which slopes are fo
 Coordinates = list[Array]
 
 
+Casters = Literal["nearest", "back", "two"]
+
+
 class ShadowMap(NamedTuple):
     """The nearest surface seen from a light.
 
     Attributes:
         depth: Window depth in [0, 1] of the nearest surface, 1 where there is none.
-        clip_from_world: The matrix that it was made with.
+        clip_from_world: The matrix that it was made with; one for each image.
+        second: Depth of the second surface, where casters of two layers were asked for.
     """
 
-    depth: Float[Array, "map_height map_width"]
-    clip_from_world: Float[Array, "4 4"]
+    depth: Float[Array, "*maps map_height map_width"]
+    clip_from_world: Float[Array, "*maps 4 4"]
+    second: Float[Array, "*maps map_height map_width"] | None = None
+
+    @property
+    def texel_from_world(self) -> Float[Array, "*maps 4 4"]:
+        """The matrix to (column, row, window depth, 1) times w."""
+        height, width = self.depth.shape[-2:]
+        viewport = texel_from_clip(height, width, dtype=self.depth.dtype)
+        return jnp.matmul(viewport, self.clip_from_world, precision="highest")
 
 
 def render_shadow_map(
     positions: Float[Array | np.ndarray, "vertices 3"],
     faces: Int[Array | np.ndarray, "faces 3"],
-    clip_from_world: Float[Array, "4 4"],
+    clip_from_world: Float[Array, "*maps 4 4"],
     *,
     map_size: int,
-    cull_front: bool = False,
+    casters: Casters = "nearest",
 ) -> ShadowMap:
     """Rasterize the scene's depth from a light.
 
     Args:
         positions: Vertices, world space.
         faces: Vertex indices.
-        clip_from_world: Of the light, for example ``light.clip_from_world(positions)``.
+        clip_from_world: Of the light, for example ``light.clip_from_world(positions)``; of
+            several images, the map has as many, made one after another.
         map_size: Texels on each side.
-        cull_front: Keep only faces turned away from the light, so that lit faces cannot
-            shade themselves; wants closed meshes, and leaks where surfaces meet.
+        casters: ``nearest`` surface; only ``back`` faces, turned away from the light, so
+            that lit faces cannot shade themselves (wants closed meshes, and leaks where
+            surfaces meet); or ``two``, the nearest surface and the one behind it.
+
+    Raises:
+        ValueError: If ``casters`` is none of these.
 
     Differentiability:
         As ``rasterize``: the depth follows the plane of the face seen at each texel.
@@ -58,9 +80,35 @@ def render_shadow_map(
     References:
         L. Williams, "Casting Curved Shadows on Curved Surfaces", SIGGRAPH 1978.
     """
-    clip = transform_points(jnp.asarray(clip_from_world), jnp.asarray(positions))
-    raster = rasterize(clip, faces, image_size=(map_size, map_size), cull_front=cull_front)
-    return ShadowMap(raster.depth, jnp.asarray(clip_from_world))
+    if casters not in ("nearest", "back", "two"):
+        raise ValueError(
+            f"render_shadow_map: expected `casters` nearest, back or two, got {casters!r}"
+        )
+    positions, size = jnp.asarray(positions), (map_size, map_size)
+
+    def one(matrix: Float[Array, "4 4"]) -> ShadowMap:
+        clip = transform_points(matrix, positions)
+        if casters == "two":
+            first, second = rasterize_two(clip, faces, image_size=size)
+            return ShadowMap(first.depth, matrix, second.depth)
+        raster = rasterize(clip, faces, image_size=size, cull_front=casters == "back")
+        return ShadowMap(raster.depth, matrix)
+
+    matrix = jnp.asarray(clip_from_world)
+    return one(matrix) if matrix.ndim == 2 else jax.vmap(one)(matrix)
+
+
+class PlaneSlope(NamedTuple):
+    """How far a comparison follows the plane of the receiver, from it to a texel's centre.
+
+    Attributes:
+        nearer: Share of the plane's change of depth that counts where the plane comes
+            nearer to the light.
+        farther: The same where it recedes.
+    """
+
+    nearer: Scalar
+    farther: Scalar
 
 
 class Receiver(NamedTuple):
@@ -83,6 +131,8 @@ class Receiver(NamedTuple):
         normal: Unit normal of the face, world space, on the side of the light or not.
         to_light: Unit vector towards the light, world space.
         texel_from_world: The map's matrix, to (column, row, window depth, 1) times w.
+        map_index: Which of several maps each point is in; None if there is one.
+        plane: How far comparisons follow the point's plane; None for not at all.
     """
 
     column: Float[Array, "*points"]
@@ -99,7 +149,9 @@ class Receiver(NamedTuple):
     position: Float[Array, "*points 3"]
     normal: Float[Array, "*points 3"]
     to_light: Float[Array, "*points 3"]
-    texel_from_world: Float[Array, "4 4"]
+    texel_from_world: Float[Array, "*maps 4 4"]
+    map_index: Int[Array, "*points"] | None = None
+    plane: PlaneSlope | None = None
 
     @property
     def footprint(self) -> Float[Array, "*points"]:
@@ -129,15 +181,63 @@ class Receiver(NamedTuple):
             self.normal,
             self.to_light,
             self.texel_from_world,
+            map_index=self.map_index,
         )
-        return moved.less_depth(self.depth_bias)
+        return moved._replace(depth_bias=self.depth_bias, plane=self.plane)
+
+    def at_texel(
+        self, across: Float[Array, "*points"], down: Float[Array, "*points"]
+    ) -> "Receiver":
+        """Return what a texel so many columns and rows away is compared with."""
+        if self.plane is None:
+            return self
+        change = across * self.depth_per_column + down * self.depth_per_row
+        followed = jnp.where(change < 0, self.plane.nearer, self.plane.farther) * change
+        return self._replace(depth=self.depth + followed)
+
+
+def choose_map(
+    position: Float[Array, "*points 3"], shadow_map: ShadowMap, *, reach: Scalar = 0.0
+) -> Int[Array, "*points"] | None:
+    """Return the first of several maps that holds each point with all that a filter reads.
+
+    Args:
+        position: World space.
+        shadow_map: Of one image or several.
+        reach: Texels from a point to the farthest texel centre that is read.
+
+    Returns:
+        Indices; where no map holds all, the first that holds the point, and 0 where none
+        does. None for a map of one image.
+    """
+    if shadow_map.depth.ndim == 2:
+        return None
+    count, height, width = shadow_map.depth.shape
+    point = [lax.stop_gradient(position[..., k]) for k in range(3)]
+    margin = lax.stop_gradient(jnp.asarray(reach))
+    best = jnp.full(position.shape[:-1], -1.0, position.dtype)
+    index = jnp.zeros(position.shape[:-1], jnp.int32)
+    for k in reversed(range(count)):
+        matrix = lax.stop_gradient(shadow_map.texel_from_world[k])
+        column, row, depth, w = (_affine(matrix[j, :3], point, matrix[j, 3]) for j in range(4))
+        # All times w: nothing is divided, and nothing behind the eye passes.
+        sides = jnp.minimum(
+            jnp.minimum(column, width * w - column), jnp.minimum(row, height * w - row)
+        )
+        within = (w > 0) & (depth >= 0) & (depth <= w)
+        level = jnp.where(within, 0.0 + (sides >= 0) + (sides >= margin * w), -1.0)
+        index = jnp.where(level >= best, k, index)
+        best = jnp.maximum(level, best)
+    return jnp.where(best > 0, index, 0)
 
 
 def receive(
     position: Float[Array, "*points 3"],
     normal: Float[Array, "*points 3"],
     to_light: Float[Array, "*points 3"],
-    texel_from_world: Float[Array, "4 4"],
+    texel_from_world: Float[Array, "*maps 4 4"],
+    *,
+    map_index: Int[Array, "*points"] | None = None,
 ) -> Receiver:
     """Locate points in a light's map.
 
@@ -146,33 +246,39 @@ def receive(
         normal: Unit normals of the faces (not the shading normals), world space. A zero
             normal gets a zero gradient.
         to_light: Unit vectors towards the light, world space.
-        texel_from_world: ``texel_from_clip(*map.depth.shape) @ map.clip_from_world``.
+        texel_from_world: ``shadow_map.texel_from_world``.
+        map_index: ``choose_map(position, shadow_map)``, if there are several maps.
 
     Differentiability:
         Smooth in everything where the point lies in front of the light and its plane is
         not seen edge-on from there; finite everywhere.
     """
     # Written out by coordinate: several times faster on a CPU than products of small arrays.
-    matrix = jnp.asarray(texel_from_world)
+    matrices = jnp.asarray(texel_from_world)
+    matrix = _entries(matrices, map_index)
     point = [position[..., k] for k in range(3)]
     ray = [to_light[..., k] for k in range(3)]
-    column, row, depth, w = (_affine(matrix[k, :3], point, matrix[k, 3]) for k in range(4))
+    column, row, depth, w = (_affine(matrix[k][:3], point, matrix[k][3]) for k in range(4))
     behind = w <= 0
     w = jnp.where(behind, 1, w)
     column, row, depth = column / w, row / w, depth / w
 
-    nearness = -_affine(matrix[3, :3], ray, 0) / w
-    depth_rate = -_affine(matrix[2, :3], ray, 0) / w - depth * nearness
+    nearness = -_affine(matrix[3][:3], ray, 0) / w
+    depth_rate = -_affine(matrix[2][:3], ray, 0) / w - depth * nearness
     density = [
-        _norm([matrix[axis, k] - texel * matrix[3, k] for k in range(3)])
+        _norm([matrix[axis][k] - texel * matrix[3][k] for k in range(3)])
         for axis, texel in enumerate((column, row))
     ]
     texel_length = w / jnp.minimum(density[0], density[1])
     # Bound of the rounding of ``matrix @ position``, in the window depth.
     sizes = [jnp.abs(coordinate) for coordinate in point]
-    terms = [_affine(jnp.abs(matrix[k, :3]), sizes, jnp.abs(matrix[k, 3])) / w for k in (2, 3)]
+    terms = [
+        _affine([jnp.abs(m) for m in matrix[k][:3]], sizes, jnp.abs(matrix[k][3])) / w
+        for k in (2, 3)
+    ]
     resolution = 2 * jnp.finfo(depth.dtype).eps * (terms[0] + depth * terms[1])
-    gradient = _depth_gradient(point, [normal[..., k] for k in range(3)], matrix)
+    inverse = _entries(jnp.linalg.inv(matrices), map_index)
+    gradient = _depth_gradient(point, [normal[..., k] for k in range(3)], inverse)
     steepest = _STEEPEST * jnp.abs(depth_rate) * texel_length
     slope = _norm(gradient)
     limit = jnp.where(slope > steepest, safe_divide(steepest, slope), 1)
@@ -191,19 +297,31 @@ def receive(
         position,
         normal,
         to_light,
-        matrix,
+        matrices,
+        map_index,
     )
 
 
-def _depth_gradient(point: Coordinates, normal: Coordinates, matrix: Array) -> Coordinates:
+def _entries(
+    matrices: Float[Array, "*maps 4 4"], map_index: Int[Array, "*points"] | None
+) -> list[Coordinates]:
+    """Return a matrix's rows, each entry a number or one for each point."""
+    if map_index is None:
+        return [[matrices[j, k] for k in range(4)] for j in range(4)]
+    pick = lambda table: table.at[map_index].get(mode="promise_in_bounds")
+    return [[pick(matrices[:, j, k]) for k in range(4)] for j in range(4)]
+
+
+def _depth_gradient(
+    point: Coordinates, normal: Coordinates, inverse: list[Coordinates]
+) -> Coordinates:
     """Return the slope of each point's plane in window space, where it is a plane again.
 
     A plane is a row vector, and goes to window space by the inverse of the points' matrix.
     """
-    inverse = jnp.linalg.inv(matrix)
     offset = -sum(n * p for n, p in zip(normal, point, strict=True))
     across_u, across_v, along = (
-        _affine(inverse[:3, k], normal, inverse[3, k] * offset) for k in range(3)
+        _affine([inverse[j][k] for j in range(3)], normal, inverse[3][k] * offset) for k in range(3)
     )
     least = 1e-6 * _norm([across_u, across_v])
     edge_on = jnp.abs(along) <= least
@@ -211,7 +329,7 @@ def _depth_gradient(point: Coordinates, normal: Coordinates, matrix: Array) -> C
     return [-across_u / along, -across_v / along]
 
 
-def _affine(coefficients: Array, values: Coordinates, constant: Array | int) -> Array:
+def _affine(coefficients: Array | Coordinates, values: Coordinates, constant: Array | int) -> Array:
     x, y, z = (coefficients[k] * values[k] for k in range(3))
     return x + y + z + constant
 

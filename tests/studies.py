@@ -10,7 +10,7 @@ from experiments.bias_study import Study, Trial, prepare_study
 from experiments.scene import Scene
 from experiments.scenes import load_scene
 from shadows.bias import CombinedBias, ConstantBias, SlopeBias
-from shadows.filters import BilinearFilter
+from shadows.window_filters import BilinearFilter
 from tangentspace.shading import BlinnPhongShading
 
 IMAGE_SIZE, MAP_SIZE = (128, 128), 256

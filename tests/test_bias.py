@@ -408,9 +408,9 @@ def test_only_normal_offset_moves_to_other_texels():
     for bias in (ConstantBias(0.3), SlopeBias(2.0), NormalOffsetBias(1.0)):
         moved = move(receiver, bias)
         same = bool(jnp.all((moved.column == receiver.column) & (moved.row == receiver.row)))
-        assert same is not bias.moves_texel
-    assert CombinedBias((SlopeBias(), NormalOffsetBias())).moves_texel
-    assert not CombinedBias((SlopeBias(), ConstantBias())).moves_texel
+        assert same is not bias.reads_anew
+    assert CombinedBias((SlopeBias(), NormalOffsetBias())).reads_anew
+    assert not CombinedBias((SlopeBias(), ConstantBias())).reads_anew
 
 
 def test_normal_offset_vanishes_where_the_light_is_overhead():

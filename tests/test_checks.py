@@ -170,10 +170,10 @@ def test_a_light_that_looks_past_everything_is_refused():
     matrix = aside.clip_from_world(jnp.asarray(scene.mesh.positions))
     missed = render_shadow_map(scene.mesh.positions, scene.mesh.faces, matrix, map_size=8)
     with pytest.raises(ValueError, match=r"^stacked: nothing is in the light's view"):
-        check_shadow_map(scene, missed, cull_front=False)
+        check_shadow_map(scene, missed, casters="nearest")
 
 
 def test_a_map_without_back_faces_may_be_empty():
     empty = ShadowMap(jnp.ones((4, 4)), jnp.eye(4))
-    check_shadow_map(SCENE, empty, cull_front=True)
-    check_shadow_map(SCENE, ShadowMap(empty.depth.at[1, 1].set(0.5), jnp.eye(4)), cull_front=False)
+    check_shadow_map(SCENE, empty, casters="back")
+    check_shadow_map(SCENE, ShadowMap(empty.depth.at[1, 1].set(0.5), jnp.eye(4)), casters="nearest")

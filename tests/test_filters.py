@@ -168,7 +168,7 @@ def test_behind_a_spot_light_the_shadow_test_says_lit(name, compare):
 @pytest.mark.parametrize("name", FILTERS)
 def test_weights_sum_to_1(name):
     shadow_map, receiver = random_map(), receivers(*random_places())
-    taps = FILTERS[name].taps(shadow_map, receiver)
+    taps = FILTERS[name].read(shadow_map, receiver)
     assert len(taps) == {"nearest": 1, "bilinear": 4}[name]
     assert_close(sum(tap.weight for tap in taps), np.ones(400), ulps=4)
     assert all(float(tap.weight.min()) >= 0 for tap in taps)
@@ -177,7 +177,7 @@ def test_weights_sum_to_1(name):
 @pytest.mark.parametrize("name", FILTERS)
 def test_taps_serve_while_only_depth_moves(name):
     shadow_map, receiver = random_map(), receivers(*random_places())
-    kept = FILTERS[name].taps(shadow_map, receiver)
+    kept = FILTERS[name].read(shadow_map, receiver)
     for depth in (-0.2, 0.0, 0.3):
         biased = receiver.less_depth(jnp.asarray(depth))
         expected = look(shadow_map, biased, FILTERS[name], SoftCompare(40.0))

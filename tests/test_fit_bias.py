@@ -18,10 +18,11 @@ from experiments.scenes import SHADOW_SCENES
 from experiments.sweep_bias import sweep_bias
 from shadows.bias import CombinedBias, ConstantBias, NormalOffsetBias, SlopeBias
 from shadows.compare import HardCompare
-from shadows.filters import BilinearFilter, NearestFilter
+from shadows.filters import NearestFilter
 from shadows.lights import DirectionalLight
 from shadows.render import surface_visibility
 from shadows.transforms import PerspectiveCamera, look_at
+from shadows.window_filters import BilinearFilter
 from tangentspace.shapes import merge, plane
 
 from .studies import BOTH, study, study_of, thinned
@@ -144,13 +145,13 @@ def test_a_bias_that_moves_the_texel_is_fitted():
     fit, sweep = fit_bias(trial, bias, LINEAR), sweep_bias(trial, bias, LINEAR)
     assert fit.error <= 1.02 * sweep.error
     assert fit.error < 0.02 * hard_error(trial, CombinedBias())
-    assert 0.3 < fit.values["normal-offset.texels"] < 1.5
+    assert 0.3 < fit.values["normal-offset.offset"] < 1.5
 
 
 def test_nearest_lookup_is_fitted_and_wants_half_the_slope():
     linear = study("grazing-plane").trial
-    taps = NearestFilter().taps(linear.shadow_map, linear.receiver)
-    trial = thinned(linear._replace(taps=taps))
+    taps = NearestFilter().read(linear.shadow_map, linear.receiver)
+    trial = thinned(linear._replace(reading=taps))
     bias = CombinedBias((SlopeBias(),))
     fit = fit_bias(trial, bias, NearestFilter())
     assert fit.error == 0

@@ -15,7 +15,8 @@ from experiments.options import (
 )
 from shadows.bias import Bias, CombinedBias, ConstantBias, NormalOffsetBias, SlopeBias
 from shadows.compare import Compare, HardCompare, SoftCompare
-from shadows.filters import BilinearFilter, Filter, NearestFilter
+from shadows.filters import Filter, NearestFilter
+from shadows.window_filters import BilinearFilter
 
 
 class Toy(eqx.Module):
@@ -60,7 +61,7 @@ def test_what_is_not_said_keeps_its_default():
     made = parse_techniques(Bias, ["constant", "slope", "normal-offset"], option="--bias")
     assert made == (ConstantBias(0.0), SlopeBias(2.0), NormalOffsetBias(1.0))
     assert parse_techniques(Bias, [], option="--bias") == ()
-    assert parse_technique(Compare, "soft", option="--compare") == SoftCompare(0.5)
+    assert parse_technique(Compare, ["soft"], option="--compare") == SoftCompare(0.5)
 
 
 def test_every_technique_of_shadows_is_found():
@@ -77,9 +78,9 @@ def test_every_technique_of_shadows_is_found():
 def test_a_new_class_is_found_by_its_name():
     assert techniques(Toy) == {"long-way": LongWayToy}
     assert technique_name(LongWayToy) == "long-way"
-    made = parse_technique(Toy, "long-way.height=7", option="--toy")
+    made = parse_technique(Toy, ["long-way.height=7"], option="--toy")
     assert made == LongWayToy(3.0, 7.0)
-    assert parse_technique(Toy, "long-way=7", option="--toy") == LongWayToy(7.0, 0.5)
+    assert parse_technique(Toy, ["long-way=7"], option="--toy") == LongWayToy(7.0, 0.5)
 
 
 def test_a_description_names_numbers_defaults_and_units():
@@ -120,7 +121,7 @@ def test_a_word_that_is_not_understood_is_named(word, says):
 
 def test_a_number_for_a_technique_without_numbers_is_refused():
     with pytest.raises(ValueError, match="--compare hard=1: 'hard' has no such number"):
-        parse_technique(Compare, "hard=1", option="--compare")
+        parse_technique(Compare, ["hard=1"], option="--compare")
 
 
 def test_numbers_may_be_negative_where_nothing_forbids_it():

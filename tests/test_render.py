@@ -198,7 +198,7 @@ def test_render_is_its_stages(sun_image):
 def test_stored_depth_is_the_pixels_own_within_a_footprint(sun_image):
     """In the light, a texel holds the depth of the floor at its centre."""
     receiver = quick(receive_surface)(sun_image.surface, SUN, sun_image.shadow_maps[0])
-    (tap,) = NearestFilter().taps(sun_image.shadow_maps[0], receiver)
+    (tap,) = NearestFilter().read(sun_image.shadow_maps[0], receiver)
     _, lit = sure_shadow(sun_image.surface, SUN, margin=0.05)
     lit &= np.asarray(tap.stored) < 1  # off the floor's rim
     gain = np.abs(receiver.depth - tap.stored)[lit] / np.asarray(receiver.footprint)[lit]

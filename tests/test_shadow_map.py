@@ -100,7 +100,7 @@ def test_shadow_map_of_a_box_seen_from_above(dtype):
 
 
 def test_culling_fronts_keeps_the_far_side():
-    shadow_map, _ = box_from_above(np.float64, cull_front=True)
+    shadow_map, _ = box_from_above(np.float64, casters="back")
     expected = np.ones((8, 8))
     expected[2:4, 4:6] = 0.625
     assert_close(shadow_map.depth, expected, ulps=4)
