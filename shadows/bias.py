@@ -182,8 +182,10 @@ class CombinedBias(Bias):
     @property
     def casters(self) -> Casters:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Which surfaces the terms want in the shadow map."""
-        wanted = (term.casters for term in self.terms)
-        return max(wanted, key=lambda casters: casters != "nearest", default="nearest")
+        for term in self.terms:
+            if term.casters != "nearest":
+                return term.casters
+        return "nearest"
 
     @property
     def reads_anew(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
