@@ -12,7 +12,7 @@ from rich.text import Text
 from .console import say_error
 
 _PROGRAM = "python -m experiments"
-_WITH_WORDS = ("--bias", "--filter", "--compare", "--shading")
+_WITH_WORDS = ("--bias", "--filter", "--compare", "--shading", "--layout")
 
 
 def main() -> int:

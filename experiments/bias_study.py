@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from shadows.bias import Bias, CombinedBias
 from shadows.compare import Compare, HardCompare
 from shadows.filters import Filter, look_up
+from shadows.layouts import Layout, SingleLayout
 from shadows.render import Rendering, receive_surface
 from shadows.shadow_map import Receiver, ShadowMap
 from tangentspace._math import dot
@@ -27,6 +28,8 @@ from .metrics import ShadowErrors, contact_gap, shadow_errors
 from .render_scene import render_scene, shade_scene
 from .scene import Scene
 from .truth import Occluders, nearest_occluder_distance, trace_visibility
+
+Techniques = tuple[CombinedBias, Filter, Compare]
 
 
 class Goal(eqx.Module):
@@ -44,7 +47,7 @@ class Goal(eqx.Module):
 
     @abc.abstractmethod
     def error(self, visibility: Float[Array, " pixels"]) -> Float[Array, ""]:
-        """Return what counts in the end, under hard comparison."""
+        """Return what counts in the end."""
 
 
 class TruthGoal(Goal):
@@ -110,17 +113,22 @@ class Trial(NamedTuple):
     shadow_map: ShadowMap
     goal: Goal
 
-    def visibility(self, bias: Bias, filter: Filter, compare: Compare) -> Float[Array, " pixels"]:
-        """Return the visibility of the facing pixels under a bias."""
+    def visibility(
+        self, bias: Bias, filter: Filter, compare: Compare, *, anew: bool = False
+    ) -> Float[Array, " pixels"]:
+        """Return the visibility of the facing pixels under a bias.
+
+        Args:
+            bias: Against self-shadowing.
+            filter: How the map is asked.
+            compare: Hard or soft.
+            anew: Whether the filter is not the one that ``reading`` is of.
+        """
         receiver = bias(self.receiver, filter.reach())
-        if bias.reads_anew or filter.reads_anew:
+        if anew or bias.reads_anew or filter.reads_anew:
             shadow_map = bias.prepare(self.shadow_map)
             return look_up(shadow_map, receiver, filter=filter, compare=compare)
         return filter.visibility(self.reading, receiver, compare)
-
-    def error(self, bias: Bias, filter: Filter) -> Float[Array, ""]:
-        """Return the goal's error under hard comparison."""
-        return self.goal.error(self.visibility(bias, filter, HardCompare()))
 
     @property
     def footprint_length(self) -> Float[Array, ""]:
@@ -136,6 +144,7 @@ class Study(NamedTuple):
         scene: What is seen.
         unbiased: The view with zero bias, with both passes.
         filter: How the map is asked.
+        compare: How depths become visibility in the end.
         shading: How the pictures are lit.
         truth: Ray-traced visibility.
         occluder_distance: World length along the ray to what hides the light; inf if lit.
@@ -146,28 +155,34 @@ class Study(NamedTuple):
     scene: Scene
     unbiased: Rendering
     filter: Filter
+    compare: Compare
     shading: Shading
     truth: Bool[np.ndarray, "height width"]
     occluder_distance: Float[np.ndarray, "height width"]
     facing: Bool[np.ndarray, "height width"]
     trial: Trial
 
-    def visibility(self, bias: Bias) -> Float[np.ndarray, "height width"]:
-        """Return the image of hard visibility under a bias."""
+    def visibility(self, bias: Bias | Techniques) -> Float[np.ndarray, "height width"]:
+        """Return the image of visibility under a bias, or under other techniques too."""
         image = np.zeros(self.facing.shape, np.float32)
-        image[self.facing] = hard_visibility(self.trial, bias, self.filter)
+        image[self.facing] = self._at_pixels(bias)
         return image
 
-    def errors(self, bias: Bias) -> ShadowErrors:
+    def _at_pixels(self, bias: Bias | Techniques) -> Float[Array, " pixels"]:
+        given = bias if isinstance(bias, tuple) else (bias, self.filter, self.compare)
+        anew = isinstance(bias, tuple) and not eqx.tree_equal(bias[1], self.filter)
+        return tried_visibility(self.trial, given, bool(anew))
+
+    def errors(self, bias: Bias | Techniques) -> ShadowErrors:
         """Judge a bias against the ray-traced truth."""
         covered = np.asarray(self.unbiased.surface.covered)
         return shadow_errors(self.visibility(bias), self.truth, covered)
 
-    def objective(self, bias: Bias) -> float:
-        """Return the goal's error of a bias under hard comparison."""
-        return float(self.trial.goal.error(hard_visibility(self.trial, bias, self.filter)))
+    def objective(self, bias: Bias | Techniques) -> float:
+        """Return the goal's error of a bias."""
+        return float(self.trial.goal.error(self._at_pixels(bias)))
 
-    def contact_gap(self, bias: Bias) -> float:
+    def contact_gap(self, bias: Bias | Techniques) -> float:
         """Return the world length of shadow that a bias takes away at contacts."""
         surface = self.unbiased.surface
         to_light = self.scene.lights[0].to_light(surface.position)
@@ -190,9 +205,10 @@ class Study(NamedTuple):
 
 
 @eqx.filter_jit
-def hard_visibility(trial: Trial, bias: Bias, filter: Filter) -> Float[Array, " pixels"]:
-    """Return the hard visibility of the facing pixels."""
-    return trial.visibility(bias, filter, HardCompare())
+def tried_visibility(trial: Trial, techniques: tuple, anew: bool) -> Float[Array, " pixels"]:
+    """Return the visibility of the facing pixels."""
+    bias, filter, compare = techniques
+    return trial.visibility(bias, filter, compare, anew=anew)
 
 
 def prepare_study(
@@ -203,6 +219,8 @@ def prepare_study(
     filter: Filter,
     shading: Shading,
     bias: CombinedBias = CombinedBias(),
+    compare: Compare = HardCompare(),
+    layout: Layout = SingleLayout(),
 ) -> Study:
     """Make both passes and trace the truth; the goal is that truth.
 
@@ -213,6 +231,8 @@ def prepare_study(
         filter: How the map is asked.
         shading: The lighting model of the pictures.
         bias: What will be tried; says which surfaces cast.
+        compare: How depths become visibility in the end.
+        layout: How many maps serve the light.
 
     Raises:
         ValueError: If nothing that is seen faces the light, or nothing is in its view.
@@ -224,8 +244,9 @@ def prepare_study(
         map_size=map_size,
         bias=CombinedBias(tuple(term for term in bias.terms if term.casters != "nearest")),
         filter=filter,
-        compare=HardCompare(),
+        compare=compare,
         shading=shading,
+        layout=layout,
     )
     light, surface, shadow_map = scene.lights[0], unbiased.surface, unbiased.shadow_maps[0]
     check_shadow_map(scene, shadow_map, casters=bias.casters)
@@ -246,7 +267,7 @@ def prepare_study(
     )
     reading = filter.read(filter.prepare(bias.prepare(shadow_map)), at_pixels)
     trial = Trial(at_pixels, reading, shadow_map, goal)
-    return Study(scene, unbiased, filter, shading, truth, distance, facing, trial)
+    return Study(scene, unbiased, filter, compare, shading, truth, distance, facing, trial)
 
 
 def _at_pixels(receiver: Receiver, chosen: Bool[np.ndarray, "height width"]) -> Receiver:

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from shadows.layouts import CubeLayout, Layout, SingleLayout
 from shadows.lights import DirectionalLight, Light, PointLight, SpotLight
 from shadows.shadow_map import Casters, ShadowMap
 from shadows.transforms import transform_points
@@ -66,7 +67,7 @@ def check_target(
         raise ValueError(f"{path}: has pixels that are NaN or infinite; repair the image")
 
 
-def check_scene(scene: Scene) -> None:
+def check_scene(scene: Scene, layout: Layout = SingleLayout()) -> None:
     """Refuse cameras and lights that see nothing or have no sense."""
     camera, light = scene.camera, scene.lights[0]
     near, far = float(camera.near), float(camera.far)
@@ -76,17 +77,26 @@ def check_scene(scene: Scene) -> None:
         )
     _check_light(scene.name, light)
     positions = np.asarray(scene.mesh.positions)
-    if isinstance(light, PointLight):
-        low, high = positions.min(axis=0), positions.max(axis=0)
-        if np.all((low < light.position) & (light.position < high)):
-            raise ValueError(
-                f"{scene.name}: the point light stands inside the scene, where one shadow map "
-                "cannot see all around; move it out or use a spot light"
-            )
+    if isinstance(layout, CubeLayout):
+        return
+    if stands_inside(scene, light):
+        raise ValueError(
+            f"{scene.name}: the point light stands inside the scene, where one shadow map "
+            "cannot see all around; take the cube layout, move it out or use a spot light"
+        )
     matrix = light.clip_from_world(jnp.asarray(positions))
     clip = np.asarray(transform_points(matrix, jnp.asarray(positions)))
     if not np.isfinite(clip).all() or np.all(clip[:, 3] <= 0):
         raise ValueError(f"{scene.name}: nothing is in the light's view; move or turn the light")
+
+
+def stands_inside(scene: Scene, light: Light) -> bool:
+    """Tell whether a point light stands among what it lights, so that it wants a cube of maps."""
+    positions = np.asarray(scene.mesh.positions)
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    return isinstance(light, PointLight) and bool(
+        np.all((low < light.position) & (light.position < high))
+    )
 
 
 def check_shadow_map(scene: Scene, shadow_map: ShadowMap, *, casters: Casters) -> None:

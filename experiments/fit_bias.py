@@ -1,4 +1,4 @@
-"""Fit a bias: least squares under a soft comparison that hardens.
+"""Fit a bias, or other numbers of shadow techniques: least squares, hardening.
 
 Hard comparison counts right and wrong pixels and has no slope to follow; a soft one does.
 Each level starts from where the last ended, with a harder comparison, so that the first
@@ -19,10 +19,11 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from shadows.bias import CombinedBias
+from shadows.compare import Compare, HardCompare
 from shadows.filters import Filter
 
 from .bias_space import BiasSpace, Clock, Search, soft_residual, untold
-from .bias_study import Trial
+from .bias_study import Techniques, Trial
 
 LEVELS = (1.0, 0.3, 0.1)  # softness in half texels
 _STEPS_PER_LEVEL = 8
@@ -53,10 +54,10 @@ class BiasFit(NamedTuple):
     """A fitted bias and how it came about.
 
     Attributes:
-        bias: The result.
-        values: Its fitted numbers.
+        techniques: Bias, filter and comparison of the result.
+        values: The fitted numbers.
         units: The unit of each.
-        error: Under hard comparison.
+        error: Of the goal; under hard comparison, unless a soft one was asked for.
         levels: Every solve.
         evaluations: Biases tried under hard comparison, and one for each solver step.
         seconds: Run time, without compilation.
@@ -64,7 +65,7 @@ class BiasFit(NamedTuple):
         untold: What the data does not determine, in sentences; none if it does.
     """
 
-    bias: CombinedBias
+    techniques: Techniques
     values: dict[str, float]
     units: dict[str, str]
     error: float
@@ -73,6 +74,11 @@ class BiasFit(NamedTuple):
     seconds: float
     compile_seconds: float
     untold: tuple[str, ...]
+
+    @property
+    def bias(self) -> CombinedBias:
+        """The bias of the result."""
+        return self.techniques[0]
 
     @property
     def steps(self) -> int:
@@ -86,34 +92,38 @@ def fit_bias(
     filter: Filter,
     *,
     free: Sequence[str] | None = None,
+    compare: Compare = HardCompare(),
     levels: Sequence[float] = LEVELS,
     report: Report = lambda text: None,
 ) -> BiasFit:
-    """Fit the numbers of a bias, from zero, by Levenberg-Marquardt.
+    """Fit the numbers of a bias, from zero, or of other techniques, by Levenberg-Marquardt.
 
     Args:
         trial: What is compared with what.
         bias: Which terms there are; numbers that are not free keep their values.
-        filter: Which texels are asked.
-        free: Names of the numbers to fit, as ``constant.length``; None for all.
+        filter: How the map is asked.
+        free: Names of the numbers to fit, as ``constant.length`` or ``poisson.radius``; None
+            for all of the bias.
+        compare: How depths become visibility in the end. Hard comparison has no slope to
+            follow, and is reached through soft ones; another one stays as it is.
         levels: Softness of each solve, falling, half texels.
         report: Told how far it is.
 
     Raises:
         ValueError: If a name is not one of the bias's numbers.
     """
-    space, clock = BiasSpace.of(bias, trial, free), Clock()
-    zero = jnp.zeros_like(space.step)
-    softnesses = jnp.asarray(levels, zero.dtype)
-    solve = clock.compiled(_solve, zero, space, trial, filter, softnesses[0])
-    search = Search(space, trial, filter, clock, batch=_WAY)
-    best, score = np.zeros(zero.shape), search(np.zeros((1, *zero.shape))).score(0)
-    vector, solved = zero, []
+    space, clock = BiasSpace.of(bias, filter, trial, free, compare=compare), Clock()
+    start = np.asarray(space.start)
+    softnesses = jnp.asarray(levels if space.softens else levels[:1], start.dtype)
+    solve = clock.compiled(_solve, space.start, space, trial, softnesses[0])
+    search = Search(space, trial, clock, batch=_WAY)
+    best, score = start, search(start[None]).score(0)
+    vector, solved = space.start, []
     for softness in softnesses:
         with clock.running():
-            solution = jax.block_until_ready(solve(vector, space, trial, filter, softness))
+            solution = jax.block_until_ready(solve(vector, space, trial, softness))
         vector = solution.value
-        way = np.linspace(0, 1, _WAY + 1)[1:, None] * np.asarray(vector)
+        way = start + np.linspace(0, 1, _WAY + 1)[1:, None] * (np.asarray(vector) - start)
         tried = search(way)
         if tried.score(tried.best) < score:
             best, score = way[tried.best], tried.score(tried.best)
@@ -122,9 +132,9 @@ def fit_bias(
         end = Level(float(softness), space.values(vector), float(tried.errors[-1]), steps, result)
         solved.append(end)
         report(f"softness {end.softness:.2g}: error {end.error:.3%}, {steps} steps")
-    point = jnp.asarray(best, zero.dtype)
+    point = jnp.asarray(best, start.dtype)
     return BiasFit(
-        bias=space.bias(point),
+        techniques=space.techniques(point),
         values=space.values(point),
         units=dict(zip(space.names, space.units, strict=True)),
         error=score[0],
@@ -132,7 +142,7 @@ def fit_bias(
         evaluations=search.evaluations + sum(level.steps for level in solved),
         seconds=clock.seconds,
         compile_seconds=clock.compile_seconds,
-        untold=untold(point, space, trial, filter, softnesses[0]),
+        untold=untold(point, space, trial, softnesses[0]),
     )
 
 
@@ -150,13 +160,12 @@ def _solve(
     start: Float[Array, " numbers"],
     space: BiasSpace,
     trial: Trial,
-    filter: Filter,
     softness: Float[Array, ""],
 ) -> optx.Solution:
     """Minimize the soft residual; a few numbers and many pixels want the normal equations."""
     solver = optx.LevenbergMarquardt(rtol=3e-2, atol=1e-3, linear_solver=lx.Normal(lx.Cholesky()))
     return optx.least_squares(
-        lambda vector, _: soft_residual(vector, space, trial, filter, softness),
+        lambda vector, _: soft_residual(vector, space, trial, softness),
         solver,
         start,
         options={"jac": "fwd"},

@@ -10,9 +10,10 @@ import numpy as np
 import tyro
 
 from shadows.bias import Bias, CombinedBias
+from shadows.render import check_techniques
 
 from .bias_space import free_numbers
-from .bias_study import Study, TruthGoal, prepare_study, with_target
+from .bias_study import Study, Techniques, TruthGoal, prepare_study, with_target
 from .checks import check_folder, check_scene, check_size, check_target, make_folder
 from .console import say, say_notes, say_table, stage
 from .figures import error_picture, on_background, save_comparison, save_curve
@@ -24,11 +25,14 @@ from .prepare_scene import prepare_scene
 from .provenance import commit, device, versions
 from .render_command import (
     BiasWords,
+    CompareWords,
     FilterWords,
     ImageSize,
+    LayoutWords,
     MapSize,
     SceneName,
     ShadingWords,
+    choose_layout,
     image_channels,
     parse_lookup,
     parse_shading,
@@ -63,11 +67,14 @@ def fit(
         tuple[str, ...],
         tyro.conf.arg(
             metavar="NAME",
-            help="Numbers to fit, as constant.length; the others keep the values of --bias.",
-            help_behavior_hint="(default: all)",
+            help="Numbers to fit, of bias, filter or comparison, as constant.length or "
+            "poisson.radius; the others keep their values.",
+            help_behavior_hint="(default: all of the bias)",
         ),
     ] = (),
+    layout: LayoutWords = (),
     filter: FilterWords = ("bilinear",),
+    compare: CompareWords = (),
     image_size: ImageSize = (512, 512),
     shadow_map_size: MapSize = 1024,
     shading: ShadingWords = ("blinn-phong",),
@@ -83,24 +90,28 @@ def fit(
     check_size("--image-size", *image_size)
     check_size("--shadow-map-size", shadow_map_size)
     terms = CombinedBias(parse_techniques(Bias, bias, option="--bias"))
-    free_numbers(terms, free or None)
-    lookup, _ = parse_lookup(terms, filter, ())
+    lookup, comparison = parse_lookup(filter, compare)
+    check_techniques(terms, lookup)
+    free_numbers(terms, free or None, filter=lookup, compare=comparison)
     model = parse_shading(shading)
     goal = None if target is None else read_image(target)
     if goal is not None and target is not None:
         check_target(target, goal, image_size)
     with stage(f"loading {scene}"):
         loaded = prepare_scene(load_scene(scene))
-        check_scene(loaded)
+        maps = choose_layout(loaded, layout)
+        check_scene(loaded, maps)
     say_notes(loaded.notes)
     with stage("rendering both passes and tracing the truth"):
         study = prepare_study(
             loaded,
             image_size=image_size,
             map_size=shadow_map_size,
-            bias=terms,
             filter=lookup,
             shading=model,
+            bias=terms,
+            compare=comparison,
+            layout=maps,
         )
         if goal is not None and target is not None:
             limit = 1.0 if target.suffix.lower() == ".png" else np.inf
@@ -110,21 +121,26 @@ def fit(
     pictures.write("before", CombinedBias())
     pictures.write_truth()
     with stage("fitting") as report:
-        fitted = fit_bias(study.trial, terms, lookup, free=free or None, report=report)
-    pictures.write("after", fitted.bias)
+        fitted = fit_bias(
+            study.trial, terms, lookup, free=free or None, compare=comparison, report=report
+        )
+    pictures.write("after", fitted.techniques)
     with stage("sweeping") as report:
-        swept = sweep_bias(study.trial, terms, lookup, free=free or None, report=report)
-    biases = {"before": CombinedBias(), "after": fitted.bias, "sweep_best": swept.bias}
+        swept = sweep_bias(
+            study.trial, terms, lookup, free=free or None, compare=comparison, report=report
+        )
+    biases = {"before": CombinedBias(), "after": fitted.techniques, "sweep_best": swept.techniques}
     errors = {name: study.errors(choice) for name, choice in biases.items()}
     with stage("drawing"):
-        pictures.write("sweep_best", swept.bias)
-        large = _scaled(fitted.bias, _TOO_LARGE)
+        pictures.write("sweep_best", swept.techniques)
+        large = _scaled(fitted.techniques, _TOO_LARGE)
         pictures.write("too_large", large)
         pictures.write_comparison({**errors, "too_large": study.errors(large)})
         _write_curve(study, fitted, errors, out)
     settings = {
         "scene": scene, "target": None if target is None else str(target), "bias": list(bias),
-        "filter": list(filter), "image_size": list(image_size), "shadow_map_size": shadow_map_size,
+        "filter": list(filter), "compare": list(compare), "layout": list(layout),
+        "image_size": list(image_size), "shadow_map_size": shadow_map_size,
         "shading": list(shading),
     }  # fmt: skip
     summary = _summary(study, biases, errors, fitted, swept)
@@ -141,7 +157,7 @@ class _Pictures:
         self._covered = np.asarray(study.unbiased.surface.covered)
         self._panels: dict[str, np.ndarray] = {}
 
-    def write(self, name: str, bias: CombinedBias) -> None:
+    def write(self, name: str, bias: CombinedBias | Techniques) -> None:
         """Write an image and its error picture."""
         visibility = self._study.visibility(bias)
         color = self._write_image(name, visibility)
@@ -184,7 +200,7 @@ def _write_curve(
 ) -> None:
     """Follow acne and leak while the fitted bias grows from zero to 64 times itself."""
     scales = np.concatenate([[0], np.geomspace(1 / 16, 64, 61)])
-    curve = [study.errors(_scaled(fitted.bias, scale)) for scale in scales]
+    curve = [study.errors(_scaled(fitted.techniques, scale)) for scale in scales]
     save_curve(
         out / "acne_leak_curve.png",
         scales=scales,
@@ -195,13 +211,14 @@ def _write_curve(
     )
 
 
-def _scaled(bias: CombinedBias, scale: float) -> CombinedBias:
-    return jax.tree.map(lambda number: number * np.float32(scale), bias)
+def _scaled(techniques: Techniques, scale: float) -> Techniques:
+    bias, filter, compare = techniques
+    return jax.tree.map(lambda number: number * np.float32(scale), bias), filter, compare
 
 
 def _summary(
     study: Study,
-    biases: Mapping[str, CombinedBias],
+    biases: Mapping[str, CombinedBias | Techniques],
     errors: Mapping[str, ShadowErrors],
     fitted: BiasFit,
     swept: BiasSweep,

@@ -99,9 +99,10 @@ def parse_techniques(
     for word in words:
         head, has_value, text = word.partition("=")
         name, has_field, field_name = head.partition(".")
-        name = name or last
-        if not name:
-            raise ValueError(f"{option}{head}: of which technique? Name one with {option}")
+        if word.startswith("."):
+            name = last
+            if not name:
+                raise ValueError(f"{option}{head}: of which technique? Name one with {option}")
         if name not in known:
             raise ValueError(f"{option} {word}: no such technique '{name}'; {hint(name, known)}")
         last = name

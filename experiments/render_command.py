@@ -11,17 +11,19 @@ from jaxtyping import Array
 from shadows.bias import Bias, CombinedBias
 from shadows.compare import Compare
 from shadows.filters import Filter
-from shadows.render import Rendering, check_techniques
+from shadows.layouts import CubeLayout, Layout, SingleLayout
+from shadows.render import Rendering, check_techniques, default_bias
 from shadows.shadow_map import ShadowMap
 from tangentspace.shading import Shading
 
-from .checks import check_out, check_scene, check_shadow_map, check_size
+from .checks import check_out, check_scene, check_shadow_map, check_size, stands_inside
 from .console import say, say_notes, stage
 from .figures import on_background
 from .images import Channels, write_exr, write_png
 from .options import describe, parse_technique, parse_techniques
 from .prepare_scene import prepare_scene
 from .render_scene import render_scene
+from .scene import Scene
 from .scene_maps import with_maps
 from .scenes import EMBEDDED, load_scene
 
@@ -40,6 +42,7 @@ BiasWords = Annotated[
     tyro.conf.arg(
         metavar="NAME[=VALUE]",
         help="Biases, one after another; no word for no bias. " + "; ".join(describe(Bias)) + ".",
+        help_behavior_hint="(default: analytic; adaptive for filters wider than 2x2 texels)",
     ),
 ]
 CompareWords = Annotated[
@@ -48,6 +51,14 @@ CompareWords = Annotated[
         metavar="NAME[=VALUE]",
         help="Comparison, for filters that compare. " + "; ".join(describe(Compare)) + ".",
         help_behavior_hint="(default: hard)",
+    ),
+]
+LayoutWords = Annotated[
+    tuple[str, ...],
+    tyro.conf.arg(
+        metavar="NAME[=VALUE]",
+        help="Shadow maps of a light. " + "; ".join(describe(Layout)) + ".",
+        help_behavior_hint="(default: cube for a point light inside the scene, else single)",
     ),
 ]
 FilterWords = Annotated[
@@ -89,7 +100,8 @@ def render(
     ] = None,
     image_size: ImageSize = (512, 512),
     shadow_map_size: MapSize = 1024,
-    bias: BiasWords = ("slope=2",),
+    layout: LayoutWords = (),
+    bias: BiasWords | None = None,
     compare: CompareWords = (),
     filter: FilterWords = ("bilinear",),
     shading: ShadingWords = ("blinn-phong",),
@@ -137,8 +149,8 @@ def render(
             check_out(extra, suffix)
     check_size("--image-size", *image_size)
     check_size("--shadow-map-size", shadow_map_size)
-    terms = CombinedBias(parse_techniques(Bias, bias, option="--bias"))
-    lookup, comparison = parse_lookup(terms, filter, compare)
+    lookup, comparison = parse_lookup(filter, compare)
+    terms = parse_bias(bias, lookup)
     model = parse_shading(shading)
     if reflectivity is not None and not 0 <= reflectivity <= 1:
         raise ValueError(f"--reflectivity: expected a share from 0 to 1, got {reflectivity}")
@@ -161,7 +173,8 @@ def render(
             reflectivity=reflectivity,
         )
         loaded = prepare_scene(loaded)
-        check_scene(loaded)
+        maps = choose_layout(loaded, layout)
+        check_scene(loaded, maps)
     say_notes(loaded.notes)
     with stage("compiling and rendering"):
         image = render_scene(
@@ -172,6 +185,7 @@ def render(
             filter=lookup,
             compare=comparison,
             shading=model,
+            layout=maps,
         )
     for shadow_map in image.shadow_maps:
         check_shadow_map(loaded, shadow_map, casters=terms.casters)
@@ -191,18 +205,40 @@ def render(
             say(f"wrote {path}")
 
 
-def parse_lookup(
-    bias: CombinedBias, filter: Sequence[str], compare: Sequence[str]
-) -> tuple[Filter, Compare]:
+def parse_bias(words: Sequence[str] | None, filter: Filter) -> CombinedBias:
+    """Make the bias that ``--bias`` names, or the default one of a filter.
+
+    Raises:
+        ValueError: If a word is not understood, or means nothing to the filter.
+    """
+    if words is None:
+        return CombinedBias((default_bias(filter),))
+    terms = CombinedBias(parse_techniques(Bias, words, option="--bias"))
+    check_techniques(terms, filter)
+    return terms
+
+
+def choose_layout(scene: Scene, words: Sequence[str]) -> Layout:
+    """Make the layout that ``--layout`` names, or the least that serves a scene's lights.
+
+    Raises:
+        ValueError: If the words are not understood.
+    """
+    if words:
+        return parse_technique(Layout, words, option="--layout", least=0.0)
+    inside = any(stands_inside(scene, light) for light in scene.lights)
+    return CubeLayout() if inside else SingleLayout()
+
+
+def parse_lookup(filter: Sequence[str], compare: Sequence[str]) -> tuple[Filter, Compare]:
     """Make the filter and the comparison that ``--filter`` and ``--compare`` name.
 
     Raises:
-        ValueError: If they are not understood, or mean nothing to each other or to the bias.
+        ValueError: If they are not understood, or mean nothing to each other.
     """
     lookup = parse_technique(Filter, filter, option="--filter")
     if compare and not lookup.compares:
         raise ValueError(f"--compare: --filter {filter[0]} compares no depths; drop one of them")
-    check_techniques(bias, lookup)
     return lookup, parse_technique(Compare, compare or ["hard"], option="--compare", least=0.0)
 
 
@@ -227,8 +263,10 @@ def image_channels(image: Rendering) -> Channels:
 
 
 def shadow_map_channels(shadow_maps: Sequence[ShadowMap]) -> Channels:
-    """Return the channels of a file with the shadow maps of all lights."""
-    return _numbered("depth", "Z", [shadow_map.depth for shadow_map in shadow_maps])
+    """Return the channels of a file with the maps of all lights, several of one underneath."""
+    return _numbered(
+        "depth", "Z", [np.reshape(m.depth, (-1, m.depth.shape[-1])) for m in shadow_maps]
+    )
 
 
 def _numbered(layer: str, channel: str, images: Sequence[Array | np.ndarray]) -> Channels:

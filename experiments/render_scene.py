@@ -12,6 +12,7 @@ from shadows.appearance import Appearance
 from shadows.bias import Bias
 from shadows.compare import Compare
 from shadows.filters import Filter
+from shadows.layouts import Layout, SingleLayout
 from shadows.lights import Light
 from shadows.render import Rendering, render, shade
 from shadows.surface import Surface
@@ -30,6 +31,7 @@ def render_scene(
     filter: Filter,
     compare: Compare,
     shading: Shading,
+    layout: Layout = SingleLayout(),
 ) -> Rendering:
     """Render a scene under all its lights; compiled once per set of sizes and techniques.
 
@@ -41,9 +43,10 @@ def render_scene(
         filter: How the maps are asked.
         compare: Hard or soft; for filters that compare.
         shading: The lighting model.
+        layout: How many maps serve each light.
     """
     look = (scene.materials, scene.face_materials, scene.environment)
-    arrays = (scene.mesh, scene.camera, scene.lights, look, bias, filter, compare, shading)
+    arrays = (scene.mesh, scene.camera, scene.lights, look, bias, filter, compare, shading, layout)
     static = (image_size, map_size)
     return jax.block_until_ready(_render(jax.tree.map(jnp.asarray, arrays), static))
 
@@ -63,7 +66,7 @@ def shade_scene(
 
 @eqx.filter_jit
 def _render(arrays: tuple, static: tuple) -> Rendering:
-    mesh, camera, lights, look, bias, filter, compare, shading = arrays
+    mesh, camera, lights, look, bias, filter, compare, shading, layout = arrays
     materials, face_materials, environment = look
     image_size, map_size = static
     return render(
@@ -72,6 +75,7 @@ def _render(arrays: tuple, static: tuple) -> Rendering:
         lights,
         image_size=image_size,
         map_size=map_size,
+        layout=layout,
         bias=bias,
         filter=filter,
         compare=compare,

@@ -12,6 +12,7 @@ import numpy as np
 from shadows.lights import SpotLight
 from tangentspace.shapes import box, icosphere, plane
 
+from .light_scenes import projector, slats
 from .mapped_scenes import bumpy, displaced, mirror, normal_cells
 from .mesh_file import load_scene_file
 from .options import hint
@@ -87,7 +88,11 @@ MAPPED_SCENES: dict[str, Callable[[], Scene]] = {
     "relief": relief,
     "shadowed-relief": shadowed_relief,
 }
-EMBEDDED = SHADOW_SCENES | MAPPED_SCENES
+LIGHT_SCENES: dict[str, Callable[[], Scene]] = {
+    "projector": projector,
+    "slats": slats,
+}
+EMBEDDED = SHADOW_SCENES | MAPPED_SCENES | LIGHT_SCENES
 
 
 def load_scene(name: str) -> Scene:

@@ -13,10 +13,11 @@ import numpy as np
 from jaxtyping import Float
 
 from shadows.bias import CombinedBias
+from shadows.compare import Compare, HardCompare
 from shadows.filters import Filter
 
 from .bias_space import BiasSpace, Clock, Search, Tried
-from .bias_study import Trial
+from .bias_study import Techniques, Trial
 
 _BATCH = 256
 _FIRST_REACH = 8.0  # steps of the space: footprints or texels
@@ -32,9 +33,9 @@ class BiasSweep(NamedTuple):
     """The best bias of a grid.
 
     Attributes:
-        bias: The best.
-        values: Its numbers.
-        error: Under hard comparison.
+        techniques: The best bias, filter and comparison.
+        values: Their free numbers.
+        error: Of the goal.
         points: Numbers of every bias on the last whole grid, in their own units.
         errors: The error of each.
         evaluations: Biases tried on all grids.
@@ -43,7 +44,7 @@ class BiasSweep(NamedTuple):
         converged: Whether the last halving changed the best error by less than 1 %.
     """
 
-    bias: CombinedBias
+    techniques: Techniques
     values: dict[str, float]
     error: float
     points: Float[np.ndarray, "points numbers"]
@@ -53,6 +54,11 @@ class BiasSweep(NamedTuple):
     compile_seconds: float
     converged: bool
 
+    @property
+    def bias(self) -> CombinedBias:
+        """The best bias."""
+        return self.techniques[0]
+
 
 def sweep_bias(
     trial: Trial,
@@ -60,25 +66,27 @@ def sweep_bias(
     filter: Filter,
     *,
     free: Sequence[str] | None = None,
+    compare: Compare = HardCompare(),
     report: Callable[[str], None] = lambda text: None,
 ) -> BiasSweep:
-    """Try a grid of biases under hard comparison.
+    """Try a grid of biases, or of other numbers.
 
     Args:
         trial: What is compared with what.
         bias: Which terms there are; numbers that are not free keep their values.
-        filter: Which texels are asked.
-        free: Names of the numbers to sweep, at most three; None for all.
+        filter: How the map is asked.
+        free: Names of the numbers to sweep, at most three; None for all of the bias.
+        compare: How depths become visibility.
         report: Told how far it is.
 
     Raises:
         ValueError: If a name is not one of the bias's numbers, or there are more than three.
     """
-    space, clock = BiasSpace.of(bias, trial, free), Clock()
+    space, clock = BiasSpace.of(bias, filter, trial, free, compare=compare), Clock()
     dimensions = len(space.names)
     if dimensions not in _LAST_COUNT:
         raise ValueError(f"sweep: expected at most 3 free numbers, got {dimensions}; fix some")
-    search = Search(space, trial, filter, clock, batch=_BATCH)
+    search = Search(space, trial, clock, batch=_BATCH)
     reach, count = np.full(dimensions, _FIRST_REACH), _FIRST_COUNT[dimensions]
 
     def tried(low: np.ndarray, high: np.ndarray, count: int) -> tuple[np.ndarray, Tried]:
@@ -114,7 +122,7 @@ def sweep_bias(
         if converged:
             break
     return BiasSweep(
-        bias=space.bias(jnp.asarray(best, space.step.dtype)),
+        techniques=space.techniques(jnp.asarray(best, space.step.dtype)),
         values=space.values(best),
         error=score[0],
         points=whole[0] * np.asarray(space.step),

@@ -29,12 +29,17 @@ class Spans(NamedTuple):
         length: Number of pixels.
         depth: NDC depth at the first pixel's centre.
         slope: Change of the depth from one pixel to the next.
+        front: Whether the face is seen counter-clockwise. Told by which of the span's ends
+            is on the left, so that it never contradicts the pixels covered: of faces that
+            close a surface, as many front as back ones lie over each pixel, or the eye is
+            inside.
     """
 
     column: Int[Array, " items"]
     length: Int[Array, " items"]
     depth: Float[Array, " items"]
     slope: Float[Array, " items"]
+    front: Bool[Array, " items"]
 
 
 def prefix_sum(counts: Int[Array, " items"]) -> Int[Array, " items"]:
@@ -70,7 +75,12 @@ def owners(starts: Int[Array, " owners"], first: Int[Array, ""], size: int) -> I
 
 
 def row_ranges(
-    clip: Float[Array, "axes=4 corners=3 faces"], height: int, *, cull_back: bool, cull_front: bool
+    clip: Float[Array, "axes=4 corners=3 faces"],
+    height: int,
+    *,
+    cull_back: bool,
+    cull_front: bool,
+    cull_far: bool,
 ) -> tuple[Int[Array, " faces"], Int[Array, " faces"]]:
     """Return the first row and the number of rows that each face may meet.
 
@@ -90,7 +100,7 @@ def row_ranges(
         low = jnp.minimum(low, jnp.where(crosses, cut, jnp.inf))
         high = jnp.maximum(high, jnp.where(crosses, cut, -jnp.inf))
     visible = jnp.any(front, axis=0) & jnp.all(jnp.isfinite(clip), axis=(0, 1))
-    for outside in (x < -w, x > w, z < -w, z > w):
+    for outside in (x < -w, x > w, z < -w, (z > w) & cull_far):
         visible &= ~jnp.all(outside, axis=0)
     if cull_back or cull_front:
         area = _area(x, y, w)
@@ -162,7 +172,8 @@ def spans(
     depth = depth_at(jnp.zeros_like(column))
     steps = jnp.maximum(length - 1, 0)
     slope = (depth_at(steps * (2 / width)) - depth) / jnp.maximum(steps, 1)
-    return Spans(column.astype(jnp.int32), length.astype(jnp.int32), depth, slope)
+    front = (ends[0] < ends[1]) == cut.alone_above
+    return Spans(column.astype(jnp.int32), length.astype(jnp.int32), depth, slope, front)
 
 
 class _Cut:
@@ -177,7 +188,7 @@ class _Cut:
         self._alone_0 = above[1] == above[2]
         self._alone_1 = ~self._alone_0 & (above[0] == above[2])
         self._heights = self._rotate(heights)
-        self._alone_above = self._heights[0] >= 0
+        self.alone_above = self._heights[0] >= 0
 
     def _rotate(self, values: Triple) -> Triple:
         """Put the lone vertex first."""
@@ -204,6 +215,6 @@ class _Cut:
     def _sorted(self, alone: Array, other: Array) -> tuple[Array, Array]:
         """Return the values at the edge's upper and lower end."""
         return (
-            jnp.where(self._alone_above, alone, other),
-            jnp.where(self._alone_above, other, alone),
+            jnp.where(self.alone_above, alone, other),
+            jnp.where(self.alone_above, other, alone),
         )

@@ -33,10 +33,12 @@ class Filter(eqx.Module):
     Attributes:
         compares: Whether it compares depths, so that a ``Compare`` and biases that follow
             the receiver's plane mean something to it.
-        reads_anew: Whether what it reads changes with its numbers or with a bias.
+        wide: Whether it reads farther than 2x2 texels, where one depth serves all badly.
+        reads_anew: Whether what it reads depends on the receiver's depth.
     """
 
     compares: ClassVar[bool] = True
+    wide: ClassVar[bool] = True
     reads_anew: ClassVar[bool] = False
 
     @abc.abstractmethod
@@ -94,6 +96,8 @@ class NearestFilter(TapFilter):
     Differentiability:
         None in the receiver's position across texels; visibility jumps between them.
     """
+
+    wide: ClassVar[bool] = False
 
     def reach(self) -> Scalar:
         """Return half a texel."""

@@ -1,10 +1,5 @@
 """Which face covers each pixel, and how deep: the rasterizer under every pass.
 
-Faces are expanded to rows and rows to pixels in chunks of fixed size inside ``while``
-loops: nothing to guess, nothing that overflows, memory bounded by the chunk whatever the
-mesh, and the time follows the faces and pixels that there are. The first few pixels of a
-row are written at once (most rows of a fine mesh end there), the rest in wider pieces.
-
 The depth buffer holds complex numbers ``depth + i * face``, whose order is lexicographic:
 one scatter-minimum settles both the depth and the face, and a tie goes to the lower face
 in whatever order faces arrive.
@@ -21,11 +16,9 @@ from jax import lax
 from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Complex, Float, Int
 
-from ._scan_convert import Spans, owners, prefix_sum, row_ranges, spans
+from ._fragments import Drawing, Fragments, draw
 from .interpolate import ClipPositions, Faces, window_depth
 
-_FIRST = 4  # pixels of a row that are written at once
-_PIECE = 16  # pixels of each further piece
 _EMPTY = 2.0  # NDC depth of a pixel without a face
 
 Buffer = Complex[Array, " image"]
@@ -41,15 +34,6 @@ class Raster(NamedTuple):
 
     face_ids: Int[Array, "height width"]
     depth: Float[Array, "height width"]
-
-
-class _Options(NamedTuple):
-    height: int
-    width: int
-    cull_back: bool
-    cull_front: bool
-    chunk: int
-    layers: int = 1
 
 
 def rasterize(
@@ -97,8 +81,8 @@ def rasterize(
         M. Olano, T. Greer, "Triangle Scan Conversion using 2D Homogeneous Coordinates",
         Graphics Hardware 1997.
     """
-    options = _Options(*image_size, cull_back, cull_front, chunk)
-    face_ids, depth = _rasterize(options, *_checked(clip_positions, faces, image_size, chunk))
+    drawing = Drawing(*image_size, chunk, cull_back, cull_front)
+    face_ids, depth = _rasterize(drawing, 1, *_checked(clip_positions, faces, image_size, chunk))
     return Raster(face_ids[0], depth[0])
 
 
@@ -117,8 +101,8 @@ def rasterize_two(
     References:
         C. Everitt, "Interactive Order-Independent Transparency", NVIDIA 2001 (depth peeling).
     """
-    options = _Options(*image_size, False, False, chunk, layers=2)
-    face_ids, depth = _rasterize(options, *_checked(clip_positions, faces, image_size, chunk))
+    drawing = Drawing(*image_size, chunk)
+    face_ids, depth = _rasterize(drawing, 2, *_checked(clip_positions, faces, image_size, chunk))
     return Raster(face_ids[0], depth[0]), Raster(face_ids[1], depth[1])
 
 
@@ -154,17 +138,17 @@ def _check_static(clip_positions: Array, faces: Array, image_size: tuple, chunk:
         fail("chunk", "from 2**10 to 2**18", chunk)
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _rasterize(
-    options: _Options, clip_positions: Array, faces: Array
+    drawing: Drawing, layers: int, clip_positions: Array, faces: Array
 ) -> tuple[Int[Array, "layers height width"], Float[Array, "layers height width"]]:
-    return sequential_vmap(functools.partial(_scan, options))(clip_positions, faces)
+    return sequential_vmap(functools.partial(_scan, drawing, layers))(clip_positions, faces)
 
 
 @_rasterize.defjvp
-def _rasterize_jvp(options: _Options, primals: tuple, tangents: tuple) -> tuple:
+def _rasterize_jvp(drawing: Drawing, layers: int, primals: tuple, tangents: tuple) -> tuple:
     clip_positions, faces = primals
-    face_ids, depth = _rasterize(options, clip_positions, faces)
+    face_ids, depth = _rasterize(drawing, layers, clip_positions, faces)
 
     def depths(positions: Array) -> Array:
         return jnp.stack([window_depth(positions, faces, layer) for layer in face_ids])
@@ -174,124 +158,32 @@ def _rasterize_jvp(options: _Options, primals: tuple, tangents: tuple) -> tuple:
 
 
 def _scan(
-    options: _Options, clip_positions: Array, faces: Array
+    drawing: Drawing, layers: int, clip_positions: Array, faces: Array
 ) -> tuple[Int[Array, "layers height width"], Float[Array, "layers height width"]]:
-    """Loop over chunks of faces, their rows, and the pixels of long rows."""
-    # A common power of two changes nothing but keeps products within the exponent's range.
-    w = jnp.abs(clip_positions[:, 3])
-    largest = jnp.max(jnp.where(jnp.isfinite(w), w, 0))
-    _, exponent = jnp.frexp(largest)
-    vertices = jnp.ldexp(clip_positions, -exponent).T
-    # No more rows at a time than an int32 can count.
-    chunk = min(options.chunk, -(-faces.shape[0] // 64) * 64, 2**30 // options.height)
-    steps = -(-faces.shape[0] // chunk)
-    # Added faces have three equal corners and so cover nothing.
-    corners = jnp.pad(faces.astype(jnp.int32), ((0, steps * chunk - faces.shape[0]), (0, 0))).T
-
-    pixels = options.height * options.width
+    """Find the layers one after another."""
+    pixels = drawing.height * drawing.width
     empty = jnp.full(pixels, _EMPTY, jnp.result_type(clip_positions.dtype, jnp.complex64))
-
-    def layer(before: Buffer | None) -> Buffer:
-        def step(carry: tuple) -> tuple:
-            index, buffer = carry
-            first_face = index * chunk
-            corner = lax.dynamic_slice_in_dim(corners, first_face, chunk, axis=1)
-            clip = jnp.stack([axis.at[corner].get(mode="promise_in_bounds") for axis in vertices])
-            return index + 1, _draw_faces(options, buffer, before, clip, first_face)
-
-        return lax.while_loop(lambda carry: carry[0] < steps, step, (jnp.int32(0), empty))[1]
-
-    layers = [layer(None)]
-    for _ in range(options.layers - 1):
-        layers.append(layer(layers[-1]))
-    buffer = jnp.stack(layers).reshape(-1, options.height, options.width)
+    buffers: list[Buffer] = []
+    for _ in range(layers):
+        write = functools.partial(_lower, buffers[-1] if buffers else None)
+        buffers.append(draw(drawing, clip_positions, faces, empty, write))
+    buffer = jnp.stack(buffers).reshape(-1, drawing.height, drawing.width)
     covered = buffer.real <= 1
     face_ids = jnp.where(covered, buffer.imag.astype(jnp.int32), -1)
     return face_ids, jnp.where(covered, 0.5 * buffer.real + 0.5, 1.0)
 
 
-def _draw_faces(
-    options: _Options,
-    buffer: Buffer,
-    before: Buffer | None,
-    clip: Float[Array, "axes=4 corners=3 faces"],
-    first_face: Int[Array, ""],
-) -> Buffer:
-    """Draw one chunk of faces, as many rows at a time as the chunk holds.
+def _lower(before: Buffer | None, buffer: Buffer, fragments: Fragments) -> Buffer:
+    """Keep the nearest fragments between the near and the far plane.
 
     ``before`` is the layer in front, of which only what lies behind is drawn.
     """
-    first_row, row_count = row_ranges(
-        clip, options.height, cull_back=options.cull_back, cull_front=options.cull_front
-    )
-    ends = prefix_sum(row_count)
-    starts = ends - row_count
-    total = ends[-1]
-
-    def step(carry: tuple) -> tuple:
-        first, buffer = carry
-        owner = owners(starts, first, options.chunk)
-        item = first + jnp.arange(options.chunk, dtype=jnp.int32)
-        row = _get(first_row - starts, owner) + item
-        x, y, z, w = ([_get(corner, owner) for corner in axis] for axis in clip)
-        run = spans(x, y, z, w, row, options.height, options.width)
-        run = run._replace(length=jnp.where(item < total, run.length, 0))
-        start = row * options.width + run.column
-        return first + options.chunk, _draw_spans(buffer, before, run, start, first_face + owner)
-
-    return lax.while_loop(lambda carry: carry[0] < total, step, (jnp.int32(0), buffer))[1]
-
-
-def _draw_spans(
-    buffer: Buffer,
-    before: Buffer | None,
-    run: Spans,
-    start: Int[Array, " items"],
-    face: Int[Array, " items"],
-) -> Buffer:
-    """Draw the first pixels of every span, then what is left of the long ones in pieces."""
-    first = jnp.arange(_FIRST, dtype=jnp.int32)[None]
-    buffer = _write(buffer, before, run, start, face, first)
-    piece_count = (jnp.maximum(run.length - _FIRST, 0) + (_PIECE - 1)) // _PIECE
-    ends = prefix_sum(piece_count)
-    starts = ends - piece_count
-    total = ends[-1]
-    batch = max(face.shape[0] // 8, 64)
-
-    def step(carry: tuple) -> tuple:
-        first, buffer = carry
-        owner = owners(starts, first, batch)
-        item = first + jnp.arange(batch, dtype=jnp.int32)
-        offset = (_FIRST + (item - _get(starts, owner)) * _PIECE)[:, None] + jnp.arange(
-            _PIECE, dtype=jnp.int32
-        )
-        piece = Spans(*(_get(values, owner) for values in run))
-        piece = piece._replace(length=jnp.where(item < total, piece.length, 0))
-        places = (_get(start, owner), _get(face, owner), offset)
-        return first + batch, _write(buffer, before, piece, *places)
-
-    return lax.while_loop(lambda carry: carry[0] < total, step, (jnp.int32(0), buffer))[1]
-
-
-def _write(
-    buffer: Buffer,
-    before: Buffer | None,
-    run: Spans,
-    start: Int[Array, " items"],
-    face: Int[Array, " items"],
-    offset: Int[Array, "#items pixels"],
-) -> Buffer:
-    """Lower the buffer at the given offsets into each span."""
-    depth = run.depth[:, None] + offset.astype(run.depth.dtype) * run.slope[:, None]
-    inside = (offset < run.length[:, None]) & (depth >= -1) & (depth <= 1)
-    pixel = jnp.where(inside, start[:, None] + offset, buffer.shape[0])
-    face = jnp.broadcast_to(face[:, None].astype(depth.dtype), depth.shape)
+    depth = fragments.depth
+    inside = fragments.inside & (depth >= -1) & (depth <= 1)
+    pixel = jnp.where(inside, fragments.pixel, buffer.shape[0])
+    face = jnp.broadcast_to(fragments.face[:, None].astype(depth.dtype), depth.shape)
     if before is not None:
         seen = before.at[pixel].get(mode="clip")
         behind = (depth > seen.real) | ((depth == seen.real) & (face > seen.imag))
         pixel = jnp.where(behind, pixel, buffer.shape[0])
     return buffer.at[pixel].min(lax.complex(depth, face), mode="drop")
-
-
-def _get(values: Array, index: Int[Array, " items"]) -> Array:
-    return values.at[index].get(mode="promise_in_bounds")

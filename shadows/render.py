@@ -20,10 +20,12 @@ from tangentspace.mesh import Mesh
 from tangentspace.shading import BlinnPhongShading, Shading
 
 from .appearance import Appearance, surface_appearance
-from .bias import Bias, CombinedBias, SlopeBias
+from .bias import AnalyticBias, Bias, CombinedBias
 from .compare import Compare, HardCompare
 from .filters import Filter, look_up
+from .layouts import Layout, SingleLayout
 from .lights import Light
+from .plane_bias import AdaptiveBias
 from .shadow_map import Receiver, ShadowMap, choose_map, receive, render_shadow_map
 from .surface import Surface, render_surface
 from .transforms import Camera, Scalar
@@ -85,6 +87,16 @@ def surface_visibility(
     moved = bias(receiver, reach)
     visibility = look_up(bias.prepare(shadow_map), moved, filter=filter, compare=compare)
     return jnp.where(facing & surface.covered, visibility, 0.0)
+
+
+def default_bias(filter: Filter) -> Bias:
+    """Return the least bias that clears every plane of acne under a filter.
+
+    In closed form for lookups of up to 2x2 texels and for those that compare no texels;
+    following the receiver's plane for wider ones, where one depth for all texels would take
+    away much shadow.
+    """
+    return AdaptiveBias() if filter.compares and filter.wide else AnalyticBias()
 
 
 def check_techniques(bias: Bias, filter: Filter) -> None:
@@ -156,7 +168,8 @@ def render(
     *,
     image_size: tuple[int, int] = (512, 512),
     map_size: int = 1024,
-    bias: Bias = SlopeBias(2.0),
+    layout: Layout = SingleLayout(),
+    bias: Bias | None = None,
     filter: Filter = BilinearFilter(),
     compare: Compare = HardCompare(),
     materials: Sequence[Material] = (),
@@ -174,8 +187,9 @@ def render(
         lights: One light or several.
         image_size: Height and width in pixels.
         map_size: Texels on each side of a shadow map.
-        bias: Against self-shadowing, which also says which surfaces cast; the default is the
-            least that clears every plane of acne under 2x2 lookup.
+        layout: How many maps serve each light.
+        bias: Against self-shadowing, which also says which surfaces cast; None for the least
+            that clears every plane of acne under the filter (``default_bias``).
         filter: How the maps are asked.
         compare: Hard, or soft where derivatives are wanted; for filters that compare.
         materials: How the mesh looks; none is plain white. Height textures are not applied
@@ -194,12 +208,17 @@ def render(
         In everything but the discrete choices of which face is seen; see each stage.
     """
     lights = (lights,) if isinstance(lights, Light) else tuple(lights)
+    bias = default_bias(filter) if bias is None else bias
+    check_techniques(bias, filter)
     if shadow_maps is None:
+        reach, aspect = filter.reach(), image_size[1] / image_size[0]
         shadow_maps = [
             render_shadow_map(
                 mesh.positions,
                 mesh.faces,
-                light.clip_from_world(mesh.positions),
+                layout.matrices(
+                    light, mesh.positions, camera, aspect=aspect, map_size=map_size, reach=reach
+                ),
                 map_size=map_size,
                 casters=bias.casters,
             )

@@ -6,6 +6,7 @@ each texel (or, for the tent, what its bilinear taps weigh), so visibility has n
 """
 
 import abc
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -56,6 +57,8 @@ class BilinearFilter(WindowFilter):
     Differentiability:
         Continuous in the receiver's position, and smooth between texel centres.
     """
+
+    wide: ClassVar[bool] = False
 
     def reach(self) -> Scalar:
         """Return one texel."""

@@ -7,6 +7,7 @@ import pytest
 from experiments.options import (
     describe,
     hint,
+    join_options,
     numbers,
     parse_technique,
     parse_techniques,
@@ -16,7 +17,9 @@ from experiments.options import (
 from shadows.bias import Bias, CombinedBias, ConstantBias, NormalOffsetBias, SlopeBias
 from shadows.compare import Compare, HardCompare, SoftCompare
 from shadows.filters import Filter, NearestFilter
-from shadows.window_filters import BilinearFilter
+from shadows.layer_bias import MidpointBias
+from shadows.layouts import CubeLayout, Layout
+from shadows.window_filters import PCFFilter, WindowFilter
 
 
 class Toy(eqx.Module):
@@ -65,14 +68,12 @@ def test_what_is_not_said_keeps_its_default():
 
 
 def test_every_technique_of_shadows_is_found():
-    assert techniques(Bias) == {
-        "constant": ConstantBias,
-        "slope": SlopeBias,
-        "normal-offset": NormalOffsetBias,
-    }
+    assert {"constant": ConstantBias, "midpoint": MidpointBias}.items() <= techniques(Bias).items()
     assert techniques(Compare) == {"hard": HardCompare, "soft": SoftCompare}
-    assert techniques(Filter) == {"nearest": NearestFilter, "bilinear": BilinearFilter}
+    assert {"nearest": NearestFilter, "pcf": PCFFilter}.items() <= techniques(Filter).items()
+    assert techniques(Layout)["cube"] is CubeLayout
     assert CombinedBias not in techniques(Bias).values()
+    assert WindowFilter not in techniques(Filter).values()
 
 
 def test_a_new_class_is_found_by_its_name():
@@ -89,21 +90,49 @@ def test_a_description_names_numbers_defaults_and_units():
     assert line.endswith("): Ready. With a second sentence")
     for part in ("width", "3.0 feet", "height", "0.5 inches"):
         assert part in line
-    assert [line.partition(" (")[0] for line in describe(Bias)] == [*techniques(Bias)]
+    names = [line.partition(": ")[0].partition(" (")[0] for line in describe(Bias)]
+    assert names == [*techniques(Bias)]
 
 
 def test_numbers_have_their_unit_and_full_name():
     assert numbers(SlopeBias(1.5)) == {"slope.factor": (1.5, "texel footprints")}
+    assert numbers(SlopeBias(1.5, unit="reach")) == {"slope.factor": (1.5, "reaches of the filter")}
+    assert numbers(PCFFilter(2)) == {}  # a whole number is not fitted
     assert numbers(HardCompare()) == {}
+
+
+def test_words_and_whole_numbers_are_options_too():
+    words = ["constant.unit=reach", "constant=2", "slope"]
+    made = parse_techniques(Bias, words, option="--bias")
+    assert made == (ConstantBias(2.0, unit="reach"), SlopeBias())
+    assert parse_technique(Filter, ["pcf", ".radius=3"], option="--filter") == PCFFilter(3)
+    for word, says in (
+        ("pcf=1.5", "expected a whole number, got 1.5"),
+        ("pcf=-1", "pcf: PCFFilter: expected `radius` to be a whole number of texels from 0 to 16"),
+        (".radius=1", "--filter.radius: of which technique"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            parse_technique(Filter, [word], option="--filter")
+    with pytest.raises(ValueError, match="expected world or texel or reach, got 'inch'"):
+        parse_techniques(Bias, ["slope.unit=inch"], option="--bias")
+
+
+def test_options_of_a_technique_join_its_words():
+    options = ("--filter", "--bias")
+    line = "render s --filter.radius 2 --filter pcf --out a --bias.unit=reach --bias slope"
+    joined = "render s --filter pcf .radius=2 --out a --bias slope .unit=reach"
+    assert join_options(line.split(), options) == joined.split()
+    assert join_options(["--filter.radius", "--out"], options) == ["--out", "--filter", ".radius="]
+    assert join_options(["--image.size", "3"], options) == ["--image.size", "3"]
 
 
 @pytest.mark.parametrize(
     ("word", "says"),
     [
         ("slop=1", "no such technique 'slop'; did you mean 'slope'?"),
-        ("", "no such technique ''; choose from: constant, slope, normal-offset"),
-        ("slope.fctor=1", "'slope' has no such number; did you mean 'factor'?"),
-        ("slope.factor.x=1", "has no such number"),
+        ("", "no such technique ''; choose from: constant, "),
+        ("slope.fctor=1", "'slope' has no such option; did you mean 'factor'?"),
+        ("slope.factor.x=1", "has no such option"),
         ("slope.factor", "expected a number after '=', got ''"),
         ("slope=", "expected a number after '=', got ''"),
         ("slope=two", "expected a number after '=', got 'two'"),
@@ -120,7 +149,7 @@ def test_a_word_that_is_not_understood_is_named(word, says):
 
 
 def test_a_number_for_a_technique_without_numbers_is_refused():
-    with pytest.raises(ValueError, match="--compare hard=1: 'hard' has no such number"):
+    with pytest.raises(ValueError, match="--compare hard=1: 'hard' has no such option"):
         parse_technique(Compare, ["hard=1"], option="--compare")
 
 
