@@ -32,6 +32,7 @@ def _run(arguments: Sequence[str]) -> int:
     import jax
 
     from .bake_command import bake
+    from .bake_light_command import bake as bake_light
     from .fit_bias_command import fit as fit_bias
     from .fit_normal_map_command import fit as fit_normal_map
     from .render_command import render
@@ -41,6 +42,7 @@ def _run(arguments: Sequence[str]) -> int:
         "fit-bias": fit_bias,
         "fit-normal-map": fit_normal_map,
         "bake-normals": bake,
+        "bake-light": bake_light,
     }
     try:
         _parse(arguments, commands)()

@@ -23,23 +23,19 @@ from .metrics import ShadowErrors
 from .options import parse_techniques
 from .prepare_scene import prepare_scene
 from .provenance import commit, device, versions
-from .render_command import (
+from .render_command import ImageSize, MapSize, SceneName, image_channels, shadow_map_channels
+from .scenes import load_scene
+from .sweep_bias import BiasSweep, sweep_bias
+from .technique_words import (
     BiasWords,
     CompareWords,
     FilterWords,
-    ImageSize,
     LayoutWords,
-    MapSize,
-    SceneName,
     ShadingWords,
     choose_layout,
-    image_channels,
     parse_lookup,
     parse_shading,
-    shadow_map_channels,
 )
-from .scenes import load_scene
-from .sweep_bias import BiasSweep, sweep_bias
 
 _TOO_LARGE = 16.0  # times the fitted bias, to show what is lost
 _NAMES = {

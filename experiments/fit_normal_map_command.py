@@ -23,8 +23,9 @@ from .normal_map_study import MapStudy, errors_of, load_study, make_study, texel
 from .normal_map_task import Task, Unknowns, free_leaves
 from .prepare_scene import prepare_scene
 from .provenance import commit, device, versions
-from .render_command import SceneName, ShadingWords, parse_shading
+from .render_command import SceneName
 from .scenes import load_scene
+from .technique_words import ShadingWords, parse_shading
 
 _MOST_STEPS = 600
 

@@ -8,24 +8,29 @@ import numpy as np
 import tyro
 from jaxtyping import Array
 
-from shadows.bias import Bias, CombinedBias
-from shadows.compare import Compare
-from shadows.filters import Filter
-from shadows.layouts import CubeLayout, Layout, SingleLayout
-from shadows.render import Rendering, check_techniques, default_bias
+from shadows.render import Rendering
 from shadows.shadow_map import ShadowMap
-from tangentspace.shading import Shading
 
-from .checks import check_out, check_scene, check_shadow_map, check_size, stands_inside
+from .bake_light import read_light_map
+from .checks import check_out, check_scene, check_shadow_map, check_size
 from .console import say, say_notes, stage
 from .figures import on_background
 from .images import Channels, write_exr, write_png
-from .options import describe, parse_technique, parse_techniques
 from .prepare_scene import prepare_scene
-from .render_scene import render_scene
-from .scene import Scene
+from .render_scene import render_light_map, render_scene
 from .scene_maps import with_maps
 from .scenes import EMBEDDED, load_scene
+from .technique_words import (
+    BiasWords,
+    CompareWords,
+    FilterWords,
+    LayoutWords,
+    ShadingWords,
+    choose_layout,
+    parse_bias,
+    parse_lookup,
+    parse_shading,
+)
 
 SceneName = Annotated[
     str,
@@ -37,52 +42,12 @@ SceneName = Annotated[
 ]
 ImageSize = Annotated[tuple[int, int], tyro.conf.arg(metavar="H W", help="Pixels of the image.")]
 MapSize = Annotated[int, tyro.conf.arg(metavar="N", help="Texels on each side of the shadow map.")]
-BiasWords = Annotated[
-    tuple[str, ...],
-    tyro.conf.arg(
-        metavar="NAME[=VALUE]",
-        help="Biases, one after another; no word for no bias. " + "; ".join(describe(Bias)) + ".",
-        help_behavior_hint="(default: analytic; adaptive for filters wider than 2x2 texels)",
-    ),
-]
-CompareWords = Annotated[
-    tuple[str, ...],
-    tyro.conf.arg(
-        metavar="NAME[=VALUE]",
-        help="Comparison, for filters that compare. " + "; ".join(describe(Compare)) + ".",
-        help_behavior_hint="(default: hard)",
-    ),
-]
-LayoutWords = Annotated[
-    tuple[str, ...],
-    tyro.conf.arg(
-        metavar="NAME[=VALUE]",
-        help="Shadow maps of a light. " + "; ".join(describe(Layout)) + ".",
-        help_behavior_hint="(default: cube for a point light inside the scene, else single)",
-    ),
-]
-FilterWords = Annotated[
-    tuple[str, ...],
-    tyro.conf.arg(
-        metavar="NAME[.OPTION=VALUE]",
-        help="Lookup; its options also as --filter.OPTION VALUE. "
-        + "; ".join(describe(Filter))
-        + ".",
-    ),
-]
 MapFile = Annotated[
     Path | None,
     tyro.conf.arg(
         metavar="IMAGE",
         help="Map on the surface, .png or .exr, by its uvs.",
         help_behavior_hint="(default: the scene's own)",
-    ),
-]
-ShadingWords = Annotated[
-    tuple[str, ...],
-    tyro.conf.arg(
-        metavar="NAME[.NUMBER=VALUE]",
-        help="Lighting model of the picture. " + "; ".join(describe(Shading)) + ".",
     ),
 ]
 
@@ -105,6 +70,14 @@ def render(
     compare: CompareWords = (),
     filter: FilterWords = ("bilinear",),
     shading: ShadingWords = ("blinn-phong",),
+    light_map: Annotated[
+        Path | None,
+        tyro.conf.arg(
+            metavar="MAP",
+            help="Light of bake-light instead of lights and shadow maps.",
+            help_behavior_hint="",
+        ),
+    ] = None,
     normal_map: MapFile = None,
     flip_green: Annotated[
         bool, tyro.conf.arg(help="The normal map's green points down (-Y, as DirectX has it).")
@@ -158,6 +131,10 @@ def render(
         raise ValueError(f"--height-scale: expected a finite length, got {height_scale}")
     if subdivisions < 0:
         raise ValueError(f"--subdivisions: expected at least 0, got {subdivisions}")
+    asked = {"bias": bias is not None, "compare": compare, "filter": filter != ("bilinear",)}
+    asked |= {"layout": layout, "shadow-map-out": shadow_map_out, "environment": environment}
+    for option in [name for name, given in asked.items() if given and light_map is not None]:
+        raise ValueError(f"--{option}: means nothing with --light-map; drop one of them")
     if flip_green and normal_map is None:
         raise ValueError("--flip-green: is for --normal-map, which is not given; drop it")
     with stage(f"loading {scene}"):
@@ -177,16 +154,20 @@ def render(
         check_scene(loaded, maps)
     say_notes(loaded.notes)
     with stage("compiling and rendering"):
-        image = render_scene(
-            loaded,
-            image_size=image_size,
-            map_size=shadow_map_size,
-            bias=terms,
-            filter=lookup,
-            compare=comparison,
-            shading=model,
-            layout=maps,
-        )
+        if light_map is not None:
+            loaded, light = read_light_map(light_map, loaded)
+            image = render_light_map(loaded, light, image_size=image_size, shading=model)
+        else:
+            image = render_scene(
+                loaded,
+                image_size=image_size,
+                map_size=shadow_map_size,
+                bias=terms,
+                filter=lookup,
+                compare=comparison,
+                shading=model,
+                layout=maps,
+            )
     for shadow_map in image.shadow_maps:
         check_shadow_map(loaded, shadow_map, casters=terms.casters)
     covered = np.asarray(image.surface.covered)
@@ -203,52 +184,6 @@ def render(
     for path in (out, png_out, shadow_map_out):
         if path is not None:
             say(f"wrote {path}")
-
-
-def parse_bias(words: Sequence[str] | None, filter: Filter) -> CombinedBias:
-    """Make the bias that ``--bias`` names, or the default one of a filter.
-
-    Raises:
-        ValueError: If a word is not understood, or means nothing to the filter.
-    """
-    if words is None:
-        return CombinedBias((default_bias(filter),))
-    terms = CombinedBias(parse_techniques(Bias, words, option="--bias"))
-    check_techniques(terms, filter)
-    return terms
-
-
-def choose_layout(scene: Scene, words: Sequence[str]) -> Layout:
-    """Make the layout that ``--layout`` names, or the least that serves a scene's lights.
-
-    Raises:
-        ValueError: If the words are not understood.
-    """
-    if words:
-        return parse_technique(Layout, words, option="--layout", least=0.0)
-    inside = any(stands_inside(scene, light) for light in scene.lights)
-    return CubeLayout() if inside else SingleLayout()
-
-
-def parse_lookup(filter: Sequence[str], compare: Sequence[str]) -> tuple[Filter, Compare]:
-    """Make the filter and the comparison that ``--filter`` and ``--compare`` name.
-
-    Raises:
-        ValueError: If they are not understood, or mean nothing to each other.
-    """
-    lookup = parse_technique(Filter, filter, option="--filter")
-    if compare and not lookup.compares:
-        raise ValueError(f"--compare: --filter {filter[0]} compares no depths; drop one of them")
-    return lookup, parse_technique(Compare, compare or ["hard"], option="--compare", least=0.0)
-
-
-def parse_shading(words: Sequence[str]) -> Shading:
-    """Make the lighting model that the words of ``--shading`` name.
-
-    Raises:
-        ValueError: If they name none, or several, or are not understood.
-    """
-    return parse_technique(Shading, words, option="--shading")
 
 
 def image_channels(image: Rendering) -> Channels:

@@ -8,14 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from shadows.appearance import Appearance
+from shadows.appearance import Appearance, surface_appearance
 from shadows.bias import Bias
 from shadows.compare import Compare
 from shadows.filters import Filter
 from shadows.layouts import Layout, SingleLayout
+from shadows.light_map import LightMap, look_up_light, shade_with_light_map
 from shadows.lights import Light
 from shadows.render import Rendering, render, shade
-from shadows.surface import Surface
+from shadows.surface import Surface, render_surface
 from tangentspace.environment import CubeMap
 from tangentspace.shading import Shading
 
@@ -49,6 +50,32 @@ def render_scene(
     arrays = (scene.mesh, scene.camera, scene.lights, look, bias, filter, compare, shading, layout)
     static = (image_size, map_size)
     return jax.block_until_ready(_render(jax.tree.map(jnp.asarray, arrays), static))
+
+
+def render_light_map(
+    scene: Scene, light_map: LightMap, *, image_size: tuple[int, int], shading: Shading
+) -> Rendering:
+    """Render a scene lit by its light map: no light is asked, no shadow map drawn.
+
+    Args:
+        scene: Whose vertices the map's coordinates belong to.
+        light_map: From ``bake_light_map``.
+        image_size: Height and width in pixels.
+        shading: Its ambient and diffuse coefficients count.
+    """
+    look = (scene.materials, scene.face_materials)
+    arrays = (scene.mesh, scene.camera, light_map, look, shading)
+    return jax.block_until_ready(_render_light_map(jax.tree.map(jnp.asarray, arrays), image_size))
+
+
+@eqx.filter_jit
+def _render_light_map(arrays: tuple, image_size: tuple[int, int]) -> Rendering:
+    mesh, camera, light_map, (materials, face_materials), shading = arrays
+    surface = render_surface(mesh, camera, image_size=image_size)
+    look = surface_appearance(mesh, camera, surface, materials, face_materials=face_materials)
+    light = look_up_light(mesh, surface, light_map)
+    color = shade_with_light_map(surface, light, appearance=look, shading=shading)
+    return Rendering(color, (), surface, look, ())
 
 
 def shade_scene(

@@ -9,7 +9,7 @@ from tangentspace._math import dot, safe_normalize
 from tangentspace.mesh import Mesh
 from tangentspace.vertex_normals import face_normals
 
-from .interpolate import barycentrics, gather_faces, interpolate
+from .interpolate import ClipPositions, barycentrics, gather_faces, interpolate
 from .rasterize import rasterize
 from .transforms import Camera, transform_points
 
@@ -52,21 +52,32 @@ def render_surface(mesh: Mesh, camera: Camera, *, image_size: tuple[int, int]) -
     Differentiability:
         Smooth in positions, normals and the camera inside each face; see ``rasterize``.
     """
+    matrix = camera.clip_from_world(image_size[1] / image_size[0])
+    seen = surface_at(mesh, transform_points(matrix, mesh.positions), image_size=image_size)
+    to_camera = camera.to_camera(seen.position)
+    away = (dot(seen.face_normal, to_camera) < 0)[..., None]
+    return seen._replace(
+        face_normal=jnp.where(away, -seen.face_normal, seen.face_normal),
+        normal=jnp.where(away, -seen.normal, seen.normal),
+        to_camera=to_camera,
+    )
+
+
+def surface_at(mesh: Mesh, clip: ClipPositions, *, image_size: tuple[int, int]) -> Surface:
+    """Return the surface at each pixel of any image of the mesh.
+
+    Args:
+        mesh: World space.
+        clip: Where its vertices lie in the image, clip space.
+        image_size: Height and width in pixels.
+
+    Returns:
+        With normals as the faces are wound, and ``to_camera`` along the shading normal.
+    """
     positions, faces = jnp.asarray(mesh.positions), jnp.asarray(mesh.faces)
-    clip = transform_points(camera.clip_from_world(image_size[1] / image_size[0]), positions)
     raster = rasterize(clip, faces, image_size=image_size)
     weights = barycentrics(clip, faces, raster.face_ids)
     position = interpolate(positions, faces, raster.face_ids, weights)
     normal = safe_normalize(interpolate(mesh.normals, faces, raster.face_ids, weights))
     face_normal = gather_faces(face_normals(positions, faces), raster.face_ids)
-    to_camera = camera.to_camera(position)
-    away = (dot(face_normal, to_camera) < 0)[..., None]
-    return Surface(
-        raster.face_ids,
-        raster.depth,
-        position,
-        jnp.where(away, -face_normal, face_normal),
-        jnp.where(away, -normal, normal),
-        to_camera,
-        weights,
-    )
+    return Surface(raster.face_ids, raster.depth, position, face_normal, normal, normal, weights)
