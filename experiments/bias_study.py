@@ -130,6 +130,10 @@ class Trial(NamedTuple):
             return look_up(shadow_map, receiver, filter=filter, compare=compare)
         return filter.visibility(self.reading, receiver, compare)
 
+    def error(self, bias: Bias, filter: Filter) -> Float[Array, ""]:
+        """Return the goal's error under hard comparison."""
+        return self.goal.error(self.visibility(bias, filter, HardCompare()))
+
     @property
     def footprint_length(self) -> Float[Array, ""]:
         """Median texel footprint of the pixels as a world length along the light ray."""

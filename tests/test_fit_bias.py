@@ -45,8 +45,7 @@ def outcome(name):
 
 
 def hard_error(trial, bias, filter=LINEAR):
-    error = lambda trial, bias: trial.goal.error(trial.visibility(bias, filter, HardCompare()))
-    return float(jax.jit(error)(trial, bias))
+    return float(jax.jit(lambda trial, bias: trial.error(bias, filter))(trial, bias))
 
 
 def flat_scene(*heights, light=(0.0, 1.0, 0.0)):
