@@ -1,8 +1,8 @@
 """``python -m experiments render``: one image of a scene, with its shadow map."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import tyro
@@ -10,6 +10,7 @@ from jaxtyping import Array
 
 from shadows.render import Rendering
 from shadows.shadow_map import ShadowMap
+from shadows.shafts import Medium
 
 from .bake_light import read_light_map
 from .checks import check_out, check_scene, check_shadow_map, check_size
@@ -70,6 +71,17 @@ def render(
     compare: CompareWords = (),
     filter: FilterWords = ("bilinear",),
     shading: ShadingWords = ("blinn-phong",),
+    shadows: Annotated[
+        Literal["maps", "volumes"],
+        tyro.conf.arg(help="Shadow maps, or shadow volumes: exact and hard, without a map."),
+    ] = "maps",
+    mist: Annotated[
+        float,
+        tyro.conf.arg(
+            metavar="DENSITY",
+            help="Share of light that mist scatters per world length, which shows light shafts.",
+        ),
+    ] = 0.0,
     light_map: Annotated[
         Path | None,
         tyro.conf.arg(
@@ -131,10 +143,17 @@ def render(
         raise ValueError(f"--height-scale: expected a finite length, got {height_scale}")
     if subdivisions < 0:
         raise ValueError(f"--subdivisions: expected at least 0, got {subdivisions}")
-    asked = {"bias": bias is not None, "compare": compare, "filter": filter != ("bilinear",)}
-    asked |= {"layout": layout, "shadow-map-out": shadow_map_out, "environment": environment}
-    for option in [name for name, given in asked.items() if given and light_map is not None]:
-        raise ValueError(f"--{option}: means nothing with --light-map; drop one of them")
+    if not 0 <= mist < np.inf:
+        raise ValueError(f"--mist: expected a density of at least 0, got {mist}")
+    asked = {
+        "bias": bias is not None, "compare": compare, "filter": filter != ("bilinear",),
+        "layout": layout, "shadow-map-out": shadow_map_out, "mist": mist,
+    }  # fmt: skip
+    if shadows == "volumes":
+        _refuse(asked, "--shadows volumes")
+    if light_map is not None:
+        more = {"environment": environment, "shadows": shadows == "volumes"}
+        _refuse(asked | more, "--light-map")
     if flip_green and normal_map is None:
         raise ValueError("--flip-green: is for --normal-map, which is not given; drop it")
     with stage(f"loading {scene}"):
@@ -167,6 +186,8 @@ def render(
                 compare=comparison,
                 shading=model,
                 layout=maps,
+                volumes=shadows == "volumes",
+                medium=Medium(mist) if mist else None,
             )
     for shadow_map in image.shadow_maps:
         check_shadow_map(loaded, shadow_map, casters=terms.casters)
@@ -184,6 +205,13 @@ def render(
     for path in (out, png_out, shadow_map_out):
         if path is not None:
             say(f"wrote {path}")
+
+
+def _refuse(asked: Mapping[str, object], instead: str) -> None:
+    """Refuse what was asked about shadow maps where there are none."""
+    for option, given in asked.items():
+        if given:
+            raise ValueError(f"--{option}: means nothing with {instead}; drop one of them")
 
 
 def image_channels(image: Rendering) -> Channels:

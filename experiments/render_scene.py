@@ -16,6 +16,8 @@ from shadows.layouts import Layout, SingleLayout
 from shadows.light_map import LightMap, look_up_light, shade_with_light_map
 from shadows.lights import Light
 from shadows.render import Rendering, render, shade
+from shadows.shafts import Medium, add_shafts
+from shadows.silhouettes import mesh_edges
 from shadows.surface import Surface, render_surface
 from tangentspace.environment import CubeMap
 from tangentspace.shading import Shading
@@ -33,6 +35,8 @@ def render_scene(
     compare: Compare,
     shading: Shading,
     layout: Layout = SingleLayout(),
+    volumes: bool = False,
+    medium: Medium | None = None,
 ) -> Rendering:
     """Render a scene under all its lights; compiled once per set of sizes and techniques.
 
@@ -45,9 +49,13 @@ def render_scene(
         compare: Hard or soft; for filters that compare.
         shading: The lighting model.
         layout: How many maps serve each light.
+        volumes: Cast shadows by volumes instead of maps.
+        medium: Fills the space before the eye, and shows the light's shafts.
     """
+    edges = mesh_edges(scene.mesh.positions, scene.mesh.faces) if volumes else None
     look = (scene.materials, scene.face_materials, scene.environment)
     arrays = (scene.mesh, scene.camera, scene.lights, look, bias, filter, compare, shading, layout)
+    arrays += (edges, medium)
     static = (image_size, map_size)
     return jax.block_until_ready(_render(jax.tree.map(jnp.asarray, arrays), static))
 
@@ -93,10 +101,10 @@ def shade_scene(
 
 @eqx.filter_jit
 def _render(arrays: tuple, static: tuple) -> Rendering:
-    mesh, camera, lights, look, bias, filter, compare, shading, layout = arrays
+    mesh, camera, lights, look, bias, filter, compare, shading, layout, edges, medium = arrays
     materials, face_materials, environment = look
     image_size, map_size = static
-    return render(
+    image = render(
         mesh,
         camera,
         lights,
@@ -110,7 +118,11 @@ def _render(arrays: tuple, static: tuple) -> Rendering:
         face_materials=face_materials,
         environment=environment,
         shading=shading,
+        volume_edges=edges,
     )
+    if medium is None:
+        return image
+    return add_shafts(image, camera, lights, medium, filter=filter, compare=compare)
 
 
 @eqx.filter_jit

@@ -12,7 +12,8 @@ import numpy as np
 from shadows.lights import SpotLight
 from tangentspace.shapes import box, icosphere, plane
 
-from .light_scenes import projector, slats
+from .layout_scenes import avenue, room
+from .light_scenes import projector, skylights
 from .mapped_scenes import bumpy, displaced, mirror, normal_cells
 from .mesh_file import load_scene_file
 from .options import hint
@@ -90,7 +91,9 @@ MAPPED_SCENES: dict[str, Callable[[], Scene]] = {
 }
 LIGHT_SCENES: dict[str, Callable[[], Scene]] = {
     "projector": projector,
-    "slats": slats,
+    "skylights": skylights,
+    "room": room,
+    "avenue": avenue,
 }
 EMBEDDED = SHADOW_SCENES | MAPPED_SCENES | LIGHT_SCENES
 

@@ -27,8 +27,10 @@ from .layouts import Layout, SingleLayout
 from .lights import Light
 from .plane_bias import AdaptiveBias
 from .shadow_map import Receiver, ShadowMap, choose_map, receive, render_shadow_map
+from .silhouettes import MeshEdges
 from .surface import Surface, render_surface
 from .transforms import Camera, Scalar
+from .volumes import volume_visibility
 from .window_filters import BilinearFilter
 
 Visibility = Float[Array, "height width"]
@@ -42,7 +44,7 @@ class Rendering(NamedTuple):
         visibilities: Of each light, in [0, 1]; 0 on faces turned away and on the background.
         surface: What the eye saw.
         appearance: How it looks before any light.
-        shadow_maps: What each light saw.
+        shadow_maps: What each light saw; none where shadows were cast by volumes.
     """
 
     color: Float[Array, "height width 3"]
@@ -177,6 +179,7 @@ def render(
     environment: CubeMap | None = None,
     shading: Shading = BlinnPhongShading(),
     shadow_maps: Sequence[ShadowMap] | None = None,
+    volume_edges: MeshEdges | None = None,
 ) -> Rendering:
     """Render a mesh under its lights, with a shadow map for each.
 
@@ -199,6 +202,8 @@ def render(
             black.
         shading: The lighting model.
         shadow_maps: Maps kept from before, while only the eye or a bias moved.
+        volume_edges: ``mesh_edges(mesh.positions, mesh.faces)``, to cast shadows by volumes
+            instead of maps, of which none is drawn then; None for maps.
 
     Raises:
         ValueError: If there is no light, not one kept map for each light, or the mesh lacks
@@ -210,7 +215,9 @@ def render(
     lights = (lights,) if isinstance(lights, Light) else tuple(lights)
     bias = default_bias(filter) if bias is None else bias
     check_techniques(bias, filter)
-    if shadow_maps is None:
+    if volume_edges is not None:
+        shadow_maps = ()
+    elif shadow_maps is None:
         reach, aspect = filter.reach(), image_size[1] / image_size[0]
         shadow_maps = [
             render_shadow_map(
@@ -228,10 +235,17 @@ def render(
         expected = f"expected one of `shadow_maps` for each of {len(lights)} lights"
         raise ValueError(f"render: {expected}, got {len(shadow_maps)}")
     surface = render_surface(mesh, camera, image_size=image_size)
-    visibilities = tuple(
-        surface_visibility(surface, light, shadow_map, bias=bias, filter=filter, compare=compare)
-        for light, shadow_map in zip(lights, shadow_maps, strict=True)
-    )
+    if volume_edges is not None:
+        visibilities = tuple(
+            volume_visibility(mesh, camera, surface, light, edges=volume_edges) for light in lights
+        )
+    else:
+        visibilities = tuple(
+            surface_visibility(
+                surface, light, shadow_map, bias=bias, filter=filter, compare=compare
+            )
+            for light, shadow_map in zip(lights, shadow_maps, strict=True)
+        )
     appearance = surface_appearance(mesh, camera, surface, materials, face_materials=face_materials)
     color = shade(
         surface,
