@@ -115,19 +115,21 @@ def fit_bias(
     space, clock = BiasSpace.of(bias, filter, trial, free, compare=compare), Clock()
     start = np.asarray(space.start)
     softnesses = jnp.asarray(levels if space.softens else levels[:1], start.dtype)
-    solve = clock.compiled(_solve, space.start, space, trial, softnesses[0])
+    # As many steps in all where there is one level.
+    most = _STEPS_PER_LEVEL * (1 if space.softens else len(LEVELS))
+    solve = clock.compiled(_solve, space.start, space, trial, softnesses[0], most)
     search = Search(space, trial, clock, batch=_WAY)
     best, score = start, search(start[None]).score(0)
     vector, solved = space.start, []
     for softness in softnesses:
         with clock.running():
-            solution = jax.block_until_ready(solve(vector, space, trial, softness))
+            solution = jax.block_until_ready(solve(vector, space, trial, softness, most))
         vector = solution.value
         way = start + np.linspace(0, 1, _WAY + 1)[1:, None] * (np.asarray(vector) - start)
         tried = search(way)
         if tried.score(tried.best) < score:
             best, score = way[tried.best], tried.score(tried.best)
-        result = _result(solution)
+        result = _result(solution, most)
         steps = int(solution.stats["num_steps"])
         end = Level(float(softness), space.values(vector), float(tried.errors[-1]), steps, result)
         solved.append(end)
@@ -146,12 +148,12 @@ def fit_bias(
     )
 
 
-def _result(solution: optx.Solution) -> str:
+def _result(solution: optx.Solution, most: int) -> str:
     """Return the solver's result code as a word, or its text where it is a rare one."""
     if solution.result == optx.RESULTS.successful:
         return "converged"
     if solution.result == optx.RESULTS.nonlinear_max_steps_reached:
-        return f"stopped after {_STEPS_PER_LEVEL} steps"
+        return f"stopped after {most} steps"
     return optx.RESULTS[solution.result]
 
 
@@ -161,14 +163,18 @@ def _solve(
     space: BiasSpace,
     trial: Trial,
     softness: Float[Array, ""],
+    most: int,
 ) -> optx.Solution:
     """Minimize the soft residual; a few numbers and many pixels want the normal equations."""
-    solver = optx.LevenbergMarquardt(rtol=3e-2, atol=1e-3, linear_solver=lx.Normal(lx.Cholesky()))
+    # A level only leads to the next one; the only one leads to the result.
+    rtol = 3e-2 if space.softens else 1e-4
+    linear_solver = lx.Normal(lx.Cholesky())
+    solver = optx.LevenbergMarquardt(rtol=rtol, atol=1e-3, linear_solver=linear_solver)
     return optx.least_squares(
         lambda vector, _: soft_residual(vector, space, trial, softness),
         solver,
         start,
         options={"jac": "fwd"},
-        max_steps=_STEPS_PER_LEVEL,
+        max_steps=most,
         throw=False,
     )
