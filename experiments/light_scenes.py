@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
+from shadows.lights import DirectionalLight
 from shadows.projector import Projector
 from tangentspace.shapes import box, icosphere, plane
 
@@ -27,15 +28,18 @@ def projector() -> Scene:
     return staged("projector", [plane(2.0), wall, ball, post], eye=(-1.5, 2.0, 4.2), light=light)
 
 
-def slats() -> Scene:
-    """Light that falls through the gaps of a roof of boards into a shed with an open side."""
-    boards = [
-        placed(box((1.5, 0.03, 0.14)), (0.0, 1.6, z)) for z in (-1.05, -0.6, -0.15, 0.3, 0.75)
-    ]
-    back = placed(box((1.5, 0.8, 0.03)), (0.0, 0.8, -1.25))
-    ball = placed(icosphere(0.3, subdivisions=4), (0.3, 0.3, -0.1))
-    parts = [plane(2.0), *boards, back, ball]
-    return staged("slats", parts, eye=(2.6, 1.1, 3.2), light=sun(60.0, 35.0))
+def skylights() -> Scene:
+    """Light that falls through six openings in the roof of a dark room."""
+    along = [(-1.2, 0.6), (-0.1, 0.3), (0.7, 0.3), (1.45, 0.25)]  # middle and half width, in x
+    across = [(-1.3, 0.2), (-0.4, 0.4), (1.6, 1.4)]  # in z
+    boards = [placed(box((half, 0.02, 2.25)), (x, 1.72, 0.75)) for x, half in along]
+    boards += [placed(box((1.7, 0.02, half)), (0.0, 1.68, z)) for z, half in across]
+    sides = [placed(box((0.03, 0.85, 2.25)), (x, 0.85, 0.75)) for x in (-1.7, 1.7)]
+    wall = placed(box((1.7, 0.85, 0.03)), (0.0, 0.85, -1.5))
+    ball = placed(icosphere(0.3, subdivisions=4), (-0.2, 0.3, 0.1))
+    light = DirectionalLight(sun(62.0, 90.0).direction, np.array([4.0, 3.6, 3.0], np.float32))
+    parts = [plane(3.0), *boards, *sides, wall, ball]
+    return staged("skylights", parts, eye=(0.3, 1.0, 2.9), light=light)
 
 
 def _slide(height: int, width: int) -> Float[np.ndarray, "{height} {width} 3"]:

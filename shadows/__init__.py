@@ -2,6 +2,9 @@
 
 from .appearance import Appearance as Appearance
 from .appearance import surface_appearance as surface_appearance
+from .area_lights import AreaLight as AreaLight
+from .area_lights import DiscLight as DiscLight
+from .area_lights import RectangleLight as RectangleLight
 from .bias import AnalyticBias as AnalyticBias
 from .bias import Bias as Bias
 from .bias import CombinedBias as CombinedBias
@@ -44,6 +47,7 @@ from .lights import DirectionalLight as DirectionalLight
 from .lights import Light as Light
 from .lights import PointLight as PointLight
 from .lights import SpotLight as SpotLight
+from .medium import Medium as Medium
 from .moment_filter import MomentFilter as MomentFilter
 from .moment_filter import MomentReading as MomentReading
 from .moment_filter import depth_ratio as depth_ratio
@@ -68,7 +72,6 @@ from .shadow_map import ShadowMap as ShadowMap
 from .shadow_map import choose_map as choose_map
 from .shadow_map import receive as receive
 from .shadow_map import render_shadow_map as render_shadow_map
-from .shafts import Medium as Medium
 from .shafts import Rays as Rays
 from .shafts import add_shafts as add_shafts
 from .shafts import interleaved_noise as interleaved_noise

@@ -85,8 +85,8 @@ class EVSM2Filter(MomentFilter):
 
     def lit(self, moments: Moments, depth: Float[Array, "*points"]) -> Float[Array, "*points"]:
         """Return the bound."""
-        value = jnp.exp(self.exponent * depth)
-        return self._bound(*moments, value, self.exponent)
+        mean, second = moments
+        return self._bound(mean, second, jnp.exp(self.exponent * depth), self.exponent)
 
     def _bound(
         self,
@@ -128,6 +128,8 @@ class EVSM4Filter(EVSM2Filter):
 
     def lit(self, moments: Moments, depth: Float[Array, "*points"]) -> Float[Array, "*points"]:
         """Return the smaller bound."""
+        rising = super().lit(moments[:2], depth)
+        mean, second = moments[2:]
         value = jnp.exp(-self.negative_exponent * depth)
-        falling = self._bound(*moments[2:], value, self.negative_exponent, sign=-1)
-        return jnp.minimum(super().lit(moments[:2], depth), falling)
+        falling = self._bound(mean, second, value, self.negative_exponent, sign=-1)
+        return jnp.minimum(rising, falling)

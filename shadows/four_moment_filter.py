@@ -8,6 +8,7 @@ deviations, whether the receiver lies between the two, before or behind them is 
 
 import equinox as eqx
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from .moment_filter import MomentFilter, Moments
@@ -80,21 +81,21 @@ def moment_shadow_intensity(
     spread, spread_beyond = _target_pivots(target)
     rounding = 0.25 * float(jnp.finfo(depth.dtype).eps)
     variance = jnp.maximum(b2 - b1 * b1, jnp.maximum(bias * spread, rounding))
+    scale = lax.rsqrt(variance)
+    precision = scale * scale
     covariance = b3 - b1 * b2
-    beyond = b4 - b2 * b2 - covariance * covariance / variance
+    beyond = b4 - b2 * b2 - covariance * covariance * precision
     beyond = jnp.maximum(beyond, jnp.maximum(bias * spread_beyond, rounding))
-    deviation = jnp.sqrt(variance)
-    place = (depth - b1) / deviation
-    skew = (covariance / variance - 2 * b1) / deviation
-    excess = beyond / (variance * variance)  # kurtosis - skew^2 - 1
+    place = (depth - b1) * scale
+    skew = (covariance * precision - 2 * b1) * scale
+    excess = beyond * precision * precision  # kurtosis - skew^2 - 1
 
-    # 1 / weight is the weight of the point at the receiver's depth; the sign of ``apart``
-    # tells whether it lies outside of the other two.
+    # The sign of ``apart`` tells whether the receiver lies outside of the other two points.
     apart = place * place - skew * place - 1
-    weight = 1 / (1 + place * place + apart * apart / excess)
+    weight = excess / (excess * (1 + place * place) + apart * apart)
     between = apart < 0
-    inner = (jnp.where(between, x, safe) for x, safe in ((place, 0), (skew, 0), (-apart, 1)))
-    low = _lower_weight(*inner, excess, weight)
+    place_in, skew_in = jnp.where(between, place, 0), jnp.where(between, skew, 0)
+    low = _lower_weight(place_in, skew_in, jnp.where(between, -apart, 1), excess, weight)
     behind = jnp.where(place > 0, 1 - weight, 0.0)
     return jnp.clip(jnp.where(between, low, behind), 0, 1)
 
@@ -116,7 +117,8 @@ def _lower_weight(
     place = jnp.where(mirrored, -place, place)
     root = jnp.sqrt(middle * middle + 4 * apart * (excess + apart))
     total = jnp.abs(middle) + root
-    near = (0.5 * place * total + apart) / (root * (place + 2 * (excess + apart) / total))
+    near = (0.5 * place * total + apart) * total
+    near = near / (root * (place * total + 2 * (excess + apart)))
     return jnp.where(mirrored, 1 - weight - near, near)
 
 

@@ -162,10 +162,7 @@ class CascadesLayout(Layout):
         matrices = []
         for first, last in itertools.pairwise(ends):
             centre, radius = _slice_sphere(camera, aspect, first, last)
-            # A size that rounding does not change from frame to frame.
-            _, exponent = jnp.frexp(radius)
-            unit = jnp.ldexp(jnp.ones_like(radius), exponent - 6)
-            half = jnp.ceil(radius * wider / unit + 1e-3) * unit
+            half = _coarse(radius * wider, 6)
             texel = 2 * half / map_size
             place = transform_points(view_from_world, centre)[:2]
             x, y = jnp.floor(place / texel) * texel
@@ -174,18 +171,29 @@ class CascadesLayout(Layout):
         return jnp.stack(matrices)
 
     def _ends(self, camera: Camera, points: Float[Array, "points 3"]) -> list[Array]:
-        """Return where the view's depth is cut, up to the farthest point of the scene."""
+        """Return where the view's depth is cut, up to the farthest point of the scene.
+
+        That is taken coarsely and all around, or each turn of the eye would change the sizes.
+        """
         near, far = jnp.asarray(camera.near), jnp.asarray(camera.far)
-        depths = -transform_points(jnp.asarray(camera.view_from_world), points)[:, 2]
-        deepest = jnp.max(depths)
-        far = jnp.clip(deepest, 1.001 * near, far)
+        view = transform_points(jnp.asarray(camera.view_from_world), points)[:, :3]
+        farthest = _coarse(jnp.max(jnp.sum(view**2, axis=1)) ** 0.5, 3)
+        far = jnp.clip(farthest, 1.001 * near, far)
         first = jnp.maximum(near, 1e-3 * far)
-        shares = np.arange(self.count + 1) / self.count
+        shares = np.arange(1, self.count + 1) / self.count
         ratio, equal = (
             [first * (far / first) ** s for s in shares],
             [first + (far - first) * s for s in shares],
         )
-        return [self.spread * r + (1 - self.spread) * e for r, e in zip(ratio, equal, strict=True)]
+        cuts = [self.spread * r + (1 - self.spread) * e for r, e in zip(ratio, equal, strict=True)]
+        return [near, *cuts]
+
+
+def _coarse(length: Array, bits: int) -> Array:
+    """Return the next larger of few lengths, which changes only where the length changes much."""
+    _, exponent = jnp.frexp(length)
+    unit = jnp.ldexp(jnp.ones_like(length), exponent - bits)
+    return jnp.ceil(length / unit + 1e-3) * unit
 
 
 def _widened(name: str, map_size: int, reach: Scalar) -> Scalar:

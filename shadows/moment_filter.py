@@ -13,6 +13,7 @@ of a variance. A texel without a surface is one at the far end. The map's border
 
 import abc
 import functools
+import math
 from typing import ClassVar, Literal, NamedTuple
 
 import equinox as eqx
@@ -70,7 +71,7 @@ class MomentFilter(Filter):
             raise ValueError(
                 f"{type(self).__name__}: expected `blur` box or gaussian, got {self.blur!r}"
             )
-        self._check_range("level", least=0.0, most=self.mips, limit=f"{self.mips} (`mips`)")
+        self._check_range("level", least=0.0, most=float(self.mips), limit=f"{self.mips} (`mips`)")
 
     @abc.abstractmethod
     def moments(self, depth: Float[Array, "..."]) -> Moments:
@@ -91,9 +92,9 @@ class MomentFilter(Filter):
 
     def reach(self) -> Scalar:
         """Return the radius and one texel, or what the coarser of two mips reads."""
-        if self.mips == 0:
-            return self.radius + 1.0
-        return self.radius + 1.5 * 2.0 ** jnp.ceil(self.level) - 0.5
+        known = isinstance(self.level, int | float)
+        coarser = np.ceil(self.level) if known else jnp.ceil(self.level)
+        return self.radius + 1.5 * 2.0**coarser - 0.5
 
     def prepare(self, shadow_map: ShadowMap) -> tuple[Moments, ...]:
         """Return the blurred images, those of the full size first.
@@ -136,8 +137,10 @@ class MomentFilter(Filter):
         if receiver.map_index is not None:
             ratio = ratio[receiver.map_index]
         depth = _signed(linear_depth(receiver.depth - receiver.depth_bias, ratio))
-        shadow = reading.inside * (1 - self.lit(reading.moments, depth))
-        return jnp.where(receiver.outside, 1.0, 1 - shadow)
+        inside, outside = reading.inside, 1 - reading.inside
+        # Divided by a sum that is 1: without, XLA computes it again for each color channel.
+        lit = (inside * self.lit(reading.moments, depth) + outside) / (inside + outside)
+        return jnp.where(receiver.outside, 1.0, lit)
 
     def _blurred(self, image: Float[Array, "..."]) -> Float[Array, "..."]:
         # Windows of XLA's own: as fast backwards as forwards, where sums of shifted images
@@ -170,9 +173,7 @@ class MomentFilter(Filter):
         number = float(value)
         if not (least <= number <= most) or (below and number == most):
             expected = f"from {least:g} to {'below ' if below else ''}{limit or f'{most:g}'}"
-            raise ValueError(
-                f"{type(self).__name__}: expected `{option}` {expected}, got {value}"
-            )
+            raise ValueError(f"{type(self).__name__}: expected `{option}` {expected}, got {value}")
 
 
 def depth_ratio(texel_from_world: Float[Array, "*maps 4 4"]) -> Float[Array, "*maps"]:
@@ -190,7 +191,7 @@ def depth_ratio(texel_from_world: Float[Array, "*maps 4 4"]) -> Float[Array, "*m
     """
     depth, w = texel_from_world[..., 2, :3], texel_from_world[..., 3, :3]
     squared = jnp.sum(w * w, axis=-1)
-    excess = jnp.sum((depth - w) * w, axis=-1)  # (a - 1) of it
+    excess = jnp.sum((depth - w) * w, axis=-1)  # a - 1 times that
     perspective = (squared > 0) & (excess > 0)
     return jnp.where(perspective, 1 + squared / jnp.where(perspective, excess, 1), 1.0)
 
@@ -218,8 +219,7 @@ def _window(image: Float[Array, "..."], widths: dict[int, int], *, step: int = 1
     for axis, width in widths.items():
         size[axis] = width
     strides = [step if width > 1 else 1 for width in size]
-    share = image / np.prod(size).astype(image.dtype)
-    return lax.reduce_window(share, 0.0, lax.add, size, strides, "VALID")
+    return lax.reduce_window(image / math.prod(size), 0.0, lax.add, size, strides, "VALID")
 
 
 def _halved(image: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -234,23 +234,20 @@ def _share_inside(place: Float[Array, "*points"], size: int) -> Float[Array, "*p
 def _bilinear(images: Moments, receiver: Receiver, level: int) -> Moments:
     """Read the 2x2 texels round each receiver in images of a level; the border repeats."""
     height, width = images[0].shape[-2:]
-    (left, right_share, right), (top, low_share, low) = (
-        _nearest_two(place / 2**level, size)
-        for place, size in ((receiver.column, width), (receiver.row, height))
-    )
+    left, to_right, across = _nearest_two(receiver.column / 2**level, width)
+    top, to_low, down = _nearest_two(receiver.row / 2**level, height)
     corner = top * width + left
     if receiver.map_index is not None:
         corner = corner + receiver.map_index * (height * width)
+    to_left, to_top, total = 1 - to_right, 1 - to_low, (1 - to_low) + to_low
 
     def read(image: Float[Array, "..."]) -> Float[Array, "*points"]:
         texels = image.reshape(-1)
         at = lambda offset: texels.at[corner + offset].get(mode="promise_in_bounds")
         # Weighted sums: a difference of texels that are powers of ten apart loses the smaller.
-        above, below = (
-            (1 - right_share) * at(row) + right_share * at(row + right)
-            for row in (0, low * width)
-        )
-        return (1 - low_share) * above + low_share * below
+        high, low = (to_left * at(row) + to_right * at(row + across) for row in (0, down * width))
+        # Divided by a sum that is 1: without, XLA reads and blends again for each use.
+        return (to_top * high + to_low * low) / total
 
     return tuple(read(image) for image in images)
 
@@ -260,5 +257,5 @@ def _nearest_two(
 ) -> tuple[Int[Array, "*points"], Float[Array, "*points"], int]:
     """Return the first of two texels, the weight of the second, and how far off that is."""
     place = jnp.clip(place - 0.5, 0, size - 1)
-    first = jnp.clip(jnp.floor(place), 0, max(size - 2, 0))
-    return first.astype(jnp.int32), place - first, int(size > 1)
+    first = jnp.minimum(place.astype(jnp.int32), max(size - 2, 0))
+    return first, place - first.astype(place.dtype), int(size > 1)

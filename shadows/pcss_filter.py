@@ -52,7 +52,7 @@ class PCSSFilter(Filter):
         """Refuse negative sizes, and numbers of taps out of range."""
         check_least("PCSSFilter", "light_size", self.light_size, 0.0)
         check_least("PCSSFilter", "blocker_softness", self.blocker_softness, 0.0)
-        check_least("PCSSFilter", "widest", self.widest, 1)
+        check_least("PCSSFilter", "widest", self.widest, 1.0)
         check_taps("PCSSFilter", "search_taps", self.search_taps)
         check_taps("PCSSFilter", "taps", self.taps)
 
@@ -76,8 +76,11 @@ class PCSSFilter(Filter):
         found, length = 0.0, 0.0
         for tap in taps:
             at_texel = receiver.at_texel(tap.across, tap.down)
-            weight = tap.weight * (1 - soft(tap.stored, at_texel))
-            drop = at_texel.depth - at_texel.depth_bias - tap.stored
+            # Nothing for the receiver's own surface, which would pull the mean towards it.
+            blocked = jnp.maximum(1 - 2 * soft(tap.stored, at_texel), 0) ** 2
+            weight = tap.weight * blocked
+            # How far the blocker is from the receiver, not from its plane at that texel.
+            drop = receiver.depth - receiver.depth_bias - tap.stored
             gap = _ray_length(receiver, jnp.maximum(drop, 0))
             found, length = found + weight, length + weight * gap
         found, length = jnp.sum(found, axis=0), jnp.sum(length, axis=0)

@@ -73,8 +73,6 @@ def _rounded(receiver: Receiver, reach: Scalar) -> Receiver:
 
     Beside the depth's own rounding, that of the place in the map times the slope.
     """
-    eps = 4 * float(jnp.finfo(receiver.depth.dtype).eps)
-    place = (jnp.abs(receiver.column) + reach) * jnp.abs(receiver.depth_per_column) + (
-        jnp.abs(receiver.row) + reach
-    ) * jnp.abs(receiver.depth_per_row)
-    return receiver.less_depth(receiver.depth_resolution + eps * place)
+    place = receiver.place_resolution + reach * jnp.finfo(receiver.depth.dtype).eps
+    slope = jnp.abs(receiver.depth_per_column) + jnp.abs(receiver.depth_per_row)
+    return receiver.less_depth(receiver.depth_resolution + 2 * place * slope)

@@ -124,6 +124,7 @@ class Receiver(NamedTuple):
         depth_per_row: The same from one row to the next.
         depth_rate: Window depth that a world length along the ray to the light is worth.
         depth_resolution: Differences of window depth below this are rounding.
+        place_resolution: Differences of ``column`` and ``row`` below this are rounding, texels.
         nearness: 1 over the distance to the light; 0 for parallel light.
         texel_length: Width of a texel at the point, world units; its longer side.
         outside: True where the point lies behind the light or beyond the map's depths.
@@ -143,6 +144,7 @@ class Receiver(NamedTuple):
     depth_per_row: Float[Array, "*points"]
     depth_rate: Float[Array, "*points"]
     depth_resolution: Float[Array, "*points"]
+    place_resolution: Float[Array, "*points"]
     nearness: Float[Array, "*points"]
     texel_length: Float[Array, "*points"]
     outside: Bool[Array, "*points"]
@@ -270,13 +272,13 @@ def receive(
         for axis, texel in enumerate((column, row))
     ]
     texel_length = w / jnp.minimum(density[0], density[1])
-    # Bound of the rounding of ``matrix @ position``, in the window depth.
+    # Bounds of the rounding of ``matrix @ position``, in window space.
     sizes = [jnp.abs(coordinate) for coordinate in point]
-    terms = [
-        _affine([jnp.abs(m) for m in matrix[k][:3]], sizes, jnp.abs(matrix[k][3])) / w
-        for k in (2, 3)
+    terms = [_affine([jnp.abs(m) for m in r[:3]], sizes, jnp.abs(r[3])) / w for r in matrix]
+    rounding = [
+        2 * jnp.finfo(depth.dtype).eps * (term + jnp.abs(value) * terms[3])
+        for term, value in zip(terms, (column, row, depth), strict=False)
     ]
-    resolution = 2 * jnp.finfo(depth.dtype).eps * (terms[0] + depth * terms[1])
     inverse = _entries(jnp.linalg.inv(matrices), map_index)
     gradient = _depth_gradient(point, [normal[..., k] for k in range(3)], inverse)
     steepest = _STEEPEST * jnp.abs(depth_rate) * texel_length
@@ -290,7 +292,8 @@ def receive(
         gradient[0] * limit,
         gradient[1] * limit,
         depth_rate,
-        resolution,
+        rounding[2],
+        jnp.maximum(rounding[0], rounding[1]),
         nearness,
         texel_length,
         behind | (depth > 1) | (depth < 0),

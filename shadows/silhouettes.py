@@ -102,7 +102,8 @@ def turned_to_light(
     normal = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
     towards = [light[k] - light[3] * a[k] for k in range(3)]
     height = normal[0] * towards[0] + normal[1] * towards[1] + normal[2] * towards[2]
-    return jnp.where(jnp.isfinite(height), jnp.where(height < 0, -1, 1), 0)
+    turned = jnp.where(jnp.isfinite(height), jnp.where(height < 0, -1, 1), 0)
+    return turned.astype(jnp.int32)
 
 
 def silhouette(edges: MeshEdges, turned: Int[Array, " faces"]) -> Int[Array, " edges"]:
@@ -116,7 +117,8 @@ def silhouette(edges: MeshEdges, turned: Int[Array, " faces"]) -> Int[Array, " e
         0 where faces cancel; 2 or -2 at a silhouette of a closed mesh; 1 or -1 at a border.
     """
     runs = turned[:, None] * jnp.asarray(edges.directions)
-    return jnp.zeros(len(edges.vertices), runs.dtype).at[jnp.asarray(edges.edge_ids)].add(runs)
+    count = edges.vertices.shape[0]
+    return jnp.zeros(count, runs.dtype).at[jnp.asarray(edges.edge_ids)].add(runs)
 
 
 def _first_at_place(

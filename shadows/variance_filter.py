@@ -43,8 +43,9 @@ class VSMFilter(MomentFilter):
 
     def lit(self, moments: Moments, depth: Float[Array, "*points"]) -> Float[Array, "*points"]:
         """Return the bound, its lowest part cut off."""
+        mean, second = moments
         # Four times: signed depths range over 2.
-        bound = chebyshev_bound(*moments, depth, min_variance=4 * jnp.asarray(self.min_variance))
+        bound = chebyshev_bound(mean, second, depth, min_variance=4 * self.min_variance)
         return jnp.clip((bound - self.bleeding) / (1 - self.bleeding), 0, 1)
 
 

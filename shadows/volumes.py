@@ -5,30 +5,30 @@ widens away from the light to infinity. A point is lit if it lies in no prism, a
 of prisms that it lies in is the number of faces between it and the light. To count them,
 follow the eye's ray from the point on to infinity: each surface of a prism by which the ray
 leaves counts +1, each by which it enters -1. All prisms are counted at once, since what the
-rasterizer sums has no need to know to which it belongs: the side of a prism that stands on an
-edge meets the side of the neighbour's prism, and both cancel unless the edge is on a
-silhouette (``silhouettes``). What is left to draw are front caps, which are the faces, sides
-from silhouettes to infinity, and back caps, which are the faces at infinity.
+sum needs no word on which surface is whose: two prisms that share an edge have a side there
+in common, and it cancels unless the edge is a silhouette (``silhouettes``). What is left to
+draw are the front caps, which are the faces, the sides from silhouettes to infinity, and the
+back caps, which are the faces at infinity.
 
-Eye in a volume or not: the ray is counted from the point away from the eye (Carmack's
-reverse), so what lies before it, and what the near plane cuts away, does not matter. Nothing
-is clipped at the far plane, and vertices at infinity have w = 0.
+The eye may stand in shadow: the ray is counted from the point away from the eye (Carmack's
+reverse), so what lies before the point, and what the near plane cuts away, does not matter.
+Nothing is clipped at the far plane, and vertices at infinity have w = 0.
 
-Open meshes: every face has a prism of its own, so the sum is defined for any set of
-triangles, and means the same: open meshes, borders, edges of three faces and faces wound the
-wrong way are all served, as rays would. A closed mesh could do with the prisms of its lit
-faces; that half the caps is given for meshes as they are.
+Open meshes are served like closed ones: every face has a prism of its own, so the number
+means the same for any set of triangles, with borders, edges of three faces, and faces wound
+the wrong way. (A closed mesh could do with the prisms of the faces that look to the light,
+half of the caps; the time that takes is the price of meshes as they come.)
 
-Surfaces that touch their own caps: a lit point lies on the front cap of its own face, and
-must count as before it, whatever rounding says. No bias decides that, and no comparison of
-depths: of all faces over a pixel the visible one is the nearest, so every front cap there
-lies at the point or behind it, and is counted, but for those that the near plane cut away,
-which are nearer by far. Back caps are always behind. Only sides are compared by depth, and
-they meet the surface in the edges of shadows; that is the only place where rounding decides.
+A lit point lies on a cap, its own face, and must count as before it whatever rounding says.
+No bias decides that, and no comparison of depths: of all faces over a pixel the visible one
+is the nearest, so all front caps there lie at the point or behind it, but for those that the
+near plane cut away, which are nearer by far; and back caps lie behind everything. Only sides
+are compared by depth. They meet surfaces along the edges of shadows, and only there does
+rounding decide. What every pixel sums is closed to the last digit, since triangles that share
+an edge cover complementary pixels and are told front from back by the same numbers.
 """
 
 import functools
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -42,13 +42,15 @@ from tangentspace._math import dot
 from tangentspace.mesh import Mesh
 
 from ._fragments import Drawing, Fragments, draw, get
+from ._volume_boundary import Boundary, volume_boundary
 from .lights import DirectionalLight, Light, PointLight, SpotLight
-from .silhouettes import MeshEdges, mesh_edges, silhouette, turned_to_light
+from .silhouettes import MeshEdges, mesh_edges, turned_to_light
 from .surface import Surface
-from .transforms import Camera, OrthographicCamera, transform_points
+from .transforms import Camera, OrthographicCamera
 
 _CHUNK = 2**15
-_NUDGE = np.array([5.0, 7.0, 6.0])
+# Against a light exactly along an orthographic view, where sides have no image: any direction.
+_NUDGE = np.array([2.0, 3.0, 2.5])
 
 
 def volume_visibility(
@@ -146,24 +148,6 @@ def _homogeneous(light: Light) -> Float[Array, "4"]:
     )
 
 
-class _Boundary(NamedTuple):
-    """The surfaces that bound all prisms, counter-clockwise seen from outside.
-
-    Attributes:
-        clip_positions: Vertices.
-        faces: Caps, then sides.
-        weights: How many of each face there are; negative where they are wound the other way.
-        cap_count: How many of the faces are caps.
-        face_count: How many of the faces there are; the rest is padding.
-    """
-
-    clip_positions: Float[Array, "vertices 4"]
-    faces: Int[Array, "faces 3"]
-    weights: Int[Array, " faces"]
-    cap_count: int
-    face_count: Int[Array, ""] | int
-
-
 def _count(
     parallel: bool,
     positions: Float[Array, "vertices 3"],
@@ -181,8 +165,9 @@ def _count(
     away = -light[None, :3] if parallel else positions - light[:3]
     flat = isinstance(camera, OrthographicCamera)
     if flat:
-        away = away + _NUDGE * jnp.finfo(away.dtype).eps * jnp.max(jnp.abs(away))
-    boundary = _boundary(positions, away, faces, edges, turned, matrix)
+        nudge = jnp.asarray(_NUDGE * jnp.finfo(away.dtype).eps, away.dtype)
+        away = away + nudge * jnp.max(jnp.abs(away))
+    boundary = volume_boundary(positions, away, faces, edges, turned, matrix)
     x, y, z = (points[..., k] for k in range(3))
     depth, w = (row[0] * x + row[1] * y + row[2] * z + row[3] for row in matrix[2:])
     depth = jnp.where(covered, depth / jnp.where(covered, w, 1), jnp.inf)
@@ -204,55 +189,8 @@ def _clip_from_world(camera: Camera, aspect: float) -> Float[Array, "4 4"]:
     return matrix.at[2].set(jnp.zeros(4, matrix.dtype).at[3].set(-camera.near))
 
 
-def _boundary(
-    positions: Float[Array, "vertices 3"],
-    away: Float[Array, "ends 3"],
-    faces: Int[Array, "faces 3"],
-    edges: MeshEdges,
-    turned: Int[Array, " faces"],
-    matrix: Float[Array, "4 4"],
-) -> _Boundary:
-    """Assemble the caps, and the sides of the edges that are silhouettes.
-
-    Args:
-        positions: Vertices.
-        away: The same at infinity, as directions from the light; one if it is parallel.
-        faces: Vertex indices.
-        edges: Of the mesh.
-        turned: What ``turned_to_light`` returns.
-        matrix: From world to clip space.
-    """
-    count, parallel = positions.shape[0], away.shape[0] == 1
-    at_infinity = jnp.matmul(away, matrix[:, :3].T, precision="highest")
-    clip_positions = jnp.concatenate([transform_points(matrix, positions), at_infinity])
-
-    runs = silhouette(edges, turned)
-    ends = jnp.asarray(edges.vertices)
-    order = jnp.nonzero(runs, size=runs.shape[0], fill_value=0)[0]
-    side_count = jnp.count_nonzero(runs)
-    end, start = get(ends, order).T  # the prism's side runs against its face
-    if parallel:
-        caps, cap_weights = faces, turned
-        sides = jnp.stack([start, end, jnp.full_like(end, count)], axis=-1)
-    else:
-        caps = jnp.concatenate([faces, faces + count])
-        cap_weights = jnp.concatenate([turned, -turned])
-        first = jnp.stack([start, end, end + count], axis=-1)
-        second = jnp.stack([start, end + count, start + count], axis=-1)
-        sides = jnp.stack([first, second], axis=1).reshape(-1, 3)
-    per_edge = sides.shape[0] // order.shape[0]
-    side_weights = jnp.repeat(get(runs, order), per_edge)
-    return _Boundary(
-        clip_positions,
-        jnp.concatenate([caps, sides]),
-        jnp.concatenate([cap_weights, side_weights]),
-        caps.shape[0],
-        caps.shape[0] + per_edge * side_count,
-    )
-
-
 def _sum_behind(
-    boundary: _Boundary, depth: Float[Array, "height width"]
+    boundary: Boundary, depth: Float[Array, "height width"]
 ) -> Int[Array, "height width"]:
     """Sum over what lies behind each pixel's depth: back faces +1, front faces -1."""
     depths = depth.ravel()
@@ -292,5 +230,5 @@ def _count_at_infinity(
     """
     x, y, z = jnp.matmul(away, camera.view_from_world[:3, :3].T, precision="highest").T
     clip_positions = jnp.stack([x, y, jnp.zeros_like(z), -z], axis=-1)
-    caps = _Boundary(clip_positions, faces, -turned, faces.shape[0], faces.shape[0])
+    caps = Boundary(clip_positions, faces, -turned, faces.shape[0], faces.shape[0])
     return _sum_behind(caps, jnp.full((1, 1), -jnp.inf, away.dtype))

@@ -38,3 +38,19 @@ def test_projector_throws_a_slide_onto_a_wall_past_a_ball_and_a_post():
     assert 0.05 < dark.sum() / slide.sum() < 0.5
     errors = shown.errors(CombinedBias((SlopeBias(2.0),)))
     assert errors.error < 0.02  # measured 0.012, along edges
+
+
+def test_light_falls_into_a_dark_room_through_six_openings():
+    shown = study("skylights")
+    surface = shown.unbiased.surface
+    position = np.asarray(surface.position)
+    floor = np.asarray(surface.covered) & (position[..., 1] < 1e-4)
+    assert floor.sum() > 3000
+    lit = floor & shown.truth
+    assert 0.005 < lit.sum() / floor.sum() < 0.1
+    # The patch of an opening lies where its rays lead, a height of 1.7 below.
+    shift = 1.7 / np.tan(np.deg2rad(62.0))
+    x, z = position[lit][:, 0] + shift, position[lit][:, 2]
+    through_x = [(x > 0.2) & (x < 0.4), (x > 1.0) & (x < 1.2), (x > -0.6) & (x < -0.4)]
+    through_z = [(z > -1.1) & (z < -0.8), (z > 0.0) & (z < 0.2)]
+    assert (np.any(through_x, axis=0) & np.any(through_z, axis=0)).all()
