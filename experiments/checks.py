@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from shadows.filters import Filter
 from shadows.layouts import CubeLayout, Layout, SingleLayout
 from shadows.lights import DirectionalLight, Light, PointLight, SpotLight
 from shadows.shadow_map import Casters, ShadowMap
@@ -22,6 +23,17 @@ def check_size(option: str, *sizes: int) -> None:
     if not all(1 <= size <= _LARGEST_IMAGE for size in sizes):
         got = " ".join(map(str, sizes))
         raise ValueError(f"{option}: expected sizes from 1 to {_LARGEST_IMAGE} pixels, got {got}")
+
+
+def check_reach(filter: Filter, layout: Layout, map_size: int) -> None:
+    """Refuse a filter that reaches farther than the maps, of a layout of several half a map."""
+    reach = float(filter.reach())
+    most = map_size if isinstance(layout, SingleLayout) else 0.5 * map_size - 1
+    if not reach < most:
+        raise ValueError(
+            f"--filter: reaches {reach:g} texels, expected less than {most:g} for shadow maps of "
+            f"{map_size}; choose a narrower filter or a larger --shadow-map-size"
+        )
 
 
 def check_folder(folder: Path) -> None:

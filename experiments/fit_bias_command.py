@@ -14,7 +14,7 @@ from shadows.render import check_techniques
 
 from .bias_space import free_numbers
 from .bias_study import Study, Techniques, TruthGoal, prepare_study, with_target
-from .checks import check_folder, check_scene, check_size, check_target, make_folder
+from .checks import check_folder, check_reach, check_scene, check_size, check_target, make_folder
 from .console import say, say_notes, say_table, stage
 from .figures import error_picture, on_background, save_comparison, save_curve
 from .fit_bias import BiasFit, fit_bias
@@ -97,6 +97,7 @@ def fit(
         loaded = prepare_scene(load_scene(scene))
         maps = choose_layout(loaded, layout)
         check_scene(loaded, maps)
+        check_reach(lookup, maps, shadow_map_size)
     say_notes(loaded.notes)
     with stage("rendering both passes and tracing the truth"):
         study = prepare_study(

@@ -14,7 +14,7 @@ from .staging import UP, placed, staged, sun
 
 def room() -> Scene:
     """A lamp among a ball, a post and a table in a closed room: light in every direction."""
-    walls = [placed(box((1.6, 0.05, 1.6)), (0.0, height, 0.0)) for height in (-0.05, 2.05)]
+    walls = [plane(1.7), placed(box((1.6, 0.05, 1.6)), (0.0, 2.05, 0.0))]
     walls += [placed(box((0.05, 1.0, 1.6)), (x, 1.0, 0.0)) for x in (-1.65, 1.65)]
     walls += [placed(box((1.6, 1.0, 0.05)), (0.0, 1.0, z)) for z in (-1.65, 1.65)]
     ball = placed(icosphere(0.28, subdivisions=4), (-0.75, 0.28, -0.5))

@@ -13,7 +13,7 @@ from shadows.shadow_map import ShadowMap
 from shadows.shafts import Medium
 
 from .bake_light import read_light_map
-from .checks import check_out, check_scene, check_shadow_map, check_size
+from .checks import check_out, check_reach, check_scene, check_shadow_map, check_size
 from .console import say, say_notes, stage
 from .figures import on_background
 from .images import Channels, write_exr, write_png
@@ -171,6 +171,7 @@ def render(
         loaded = prepare_scene(loaded)
         maps = choose_layout(loaded, layout)
         check_scene(loaded, maps)
+        check_reach(lookup, maps, shadow_map_size)
     say_notes(loaded.notes)
     with stage("compiling and rendering"):
         if light_map is not None:

@@ -51,7 +51,7 @@ class AreaLight(Light):
 
     def to_light(self, positions: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
         """Return unit vectors towards the light's centre."""
-        return safe_normalize(self.position - positions)
+        return safe_normalize(jnp.asarray(self.position) - positions)
 
     def radiance(self, positions: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
         """Return the color times the cosine at the light's centre; 0 behind the light."""
@@ -78,7 +78,7 @@ class AreaLight(Light):
         """Return points of the light's plane, given along two axes of which one is upwards."""
         view_from_world = look_at(self.position, self.position + jnp.asarray(self.direction), up)
         right, above = view_from_world[0, :3], view_from_world[1, :3]
-        return self.position + across[:, None] * right + along[:, None] * above
+        return jnp.asarray(self.position) + across[:, None] * right + along[:, None] * above
 
 
 class DiscLight(AreaLight):

@@ -50,6 +50,10 @@ class MomentFilter(Filter):
         blur: ``box``, or ``gaussian``: four boxes in turn, which together reach as far.
         mips: Smaller images beside the blurred one, each of half the size.
         level: Which of them is looked up, between two of them a blend; 0 is the full size.
+
+    Differentiability:
+        In the map's depths, the receiver's place, depth and bias, and the numbers; the
+        lookup is continuous, and smooth between texel centres.
     """
 
     compares: ClassVar[bool] = False
@@ -105,9 +109,10 @@ class MomentFilter(Filter):
         """
         self._check_size(*shadow_map.depth.shape[-2:])
         ratio = depth_ratio(shadow_map.texel_from_world)[..., None, None]
-        pad = [(0, 0)] * (shadow_map.depth.ndim - 2) + [(self.radius, self.radius)] * 2
-        depth = _signed(linear_depth(jnp.pad(shadow_map.depth, pad, mode="edge"), ratio))
-        levels = [tuple(self._blurred(image) for image in self.moments(depth))]
+        depth = _signed(linear_depth(shadow_map.depth, ratio))
+        pad = [(0, 0)] * (depth.ndim - 2) + [(self.radius, self.radius)] * 2
+        stored = self.moments(jnp.pad(depth, pad, mode="edge"))
+        levels = [tuple(self._blurred(image) for image in stored)]
         for _ in range(self.mips):
             levels.append(tuple(_halved(image) for image in levels[-1]))
         return tuple(levels)

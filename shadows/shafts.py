@@ -10,7 +10,7 @@ error falls with the square of the number of steps, and where a shadow's edge cr
 with the number itself. Light is scattered once and reaches the medium undimmed: only the way
 to the eye is dimmed.
 
-A point in the medium has no surface that could shade itself, and so takes no bias.
+A point in the medium has no surface that could shade itself, and so no slope and no bias.
 """
 
 import functools
@@ -175,10 +175,9 @@ def scattered_light(
     @functools.partial(jax.checkpoint, prevent_cse=False)
     def at_step(k: Float[Array, ""]) -> Float[Array, "*pixels 3"]:
         position = rays.origin + ((k + offset) * step)[..., None] * rays.direction
-        to_light = lax.optimization_barrier(light.to_light(position))
+        to_light = light.to_light(position)
         receiver = _receive_in_space(position, to_light, shadow_map, reach)
         visible = filter.visibility(filter.read(prepared, receiver), receiver, compare)
-        visible = lax.optimization_barrier(visible)
         share = visible * medium.scattered(dot(to_light, rays.direction))
         share = share * medium.transmitted(k * step)
         return share[..., None] * light.radiance(position)
@@ -216,12 +215,9 @@ def _receive_in_space(
     matrices = shadow_map.texel_from_world
     receiver = receive(position, to_light, to_light, matrices, map_index=index)
     depth = jnp.where(moved, jnp.minimum(receiver.depth, 1), receiver.depth)
-    flat = jnp.zeros_like(depth)
+    no_slope, known = jnp.zeros_like(depth), receiver.outside & ~moved
     return receiver._replace(
-        depth=depth,
-        depth_per_column=flat,
-        depth_per_row=flat,
-        outside=receiver.outside & ~moved,
+        depth=depth, depth_per_column=no_slope, depth_per_row=no_slope, outside=known
     )
 
 

@@ -89,7 +89,8 @@ def blocker_counts(
     """Count the faces between each pixel's point and the light.
 
     The point is taken on the eye's side of its face: seen from the dark side, its own face
-    counts too.
+    counts too. Faces exactly in the light's rays have no shadow: on one of them, and for a
+    light that touches a face, rounding decides.
 
     Args:
         mesh: World space; any triangles, closed or not.
@@ -180,8 +181,9 @@ def _count(
 def _clip_from_world(camera: Camera, aspect: float) -> Float[Array, "4 4"]:
     """Return the camera's matrix with a depth from -1 at the near plane, exact far away.
 
-    In perspective it is ``-near / w``: at infinity 0, where floating-point numbers are
-    densest, and never clipped.
+    In perspective it is ``-near / w``: 0 at infinity, where floating-point numbers are
+    densest. On a bunny 4 pixels of 100 000 are wrong then, however close the near plane; with
+    the camera's own depth 75, where that is at a hundredth of the usual distance.
     """
     matrix = camera.clip_from_world(aspect)
     if isinstance(camera, OrthographicCamera):

@@ -16,6 +16,7 @@ from experiments.render_scene import render_light_map, render_scene
 from experiments.scene import Material, Scene
 from experiments.truth import Occluders, trace_visibility
 from shadows import (
+    Appearance,
     BilinearFilter,
     DirectionalLight,
     HardCompare,
@@ -25,6 +26,7 @@ from shadows import (
     look_at,
     look_up_light,
     render_surface,
+    shade_with_light_map,
     texture_surface,
 )
 from tangentspace.shading import LambertShading
@@ -203,6 +205,21 @@ def test_derivatives_in_the_texels():
     change = look(texels + step) - look(texels - step)
     assert float(gradient[1, 2, 0]) == pytest.approx(float(change) / 0.2, rel=1e-3)
     assert jnp.isfinite(gradient).all()
+
+
+def test_a_maps_light_is_shaded_by_color_albedo_and_ambient():
+    mesh = jax.tree.map(jnp.asarray, FLOOR)
+    surface = texture_surface(mesh, mesh.uvs, size=(2, 3))
+    light = jnp.asarray(np.random.default_rng(0).random((2, 3, 3)), jnp.float32)
+    plain = shade_with_light_map(surface, light, shading=MATTE)
+    assert_close(plain, 0.1 + 0.5 * light, ulps=4)
+    red = jnp.broadcast_to(jnp.array([1.0, 0.0, 0.5], jnp.float32), light.shape)
+    look = Appearance(surface.normal, base_color=red)
+    assert_close(
+        shade_with_light_map(surface, light, appearance=look, shading=MATTE), red * plain, ulps=4
+    )
+    bare = surface._replace(face_ids=jnp.full_like(surface.face_ids, -1))
+    assert (shade_with_light_map(bare, light) == 0).all()
 
 
 # Files

@@ -351,7 +351,9 @@ def test_singular_points_are_finite(name, dtype):
     assert bool(((found >= 0) & (found <= 1)).all())
     in_front = found[jnp.array([0, 2, 3, 4, 5, 7])]
     np.testing.assert_allclose(in_front, np.ones(6), atol=1e-6)  # measured 5e-7, MSM
-    slopes = jax.jit(jax.jacrev(lit, argnums=(0, 1, 2, 3)))(filter, depths, weights, z)
+    options = {"xla_backend_optimization_level": 0}
+    derive = jax.jit(jax.jacrev(lit, argnums=(0, 1, 2, 3)), compiler_options=options)
+    slopes = derive(filter, depths, weights, z)
     bad = [
         jax.tree_util.keystr(path)
         for path, slope in jax.tree_util.tree_flatten_with_path(slopes)[0]

@@ -81,6 +81,12 @@ def receivers(column, row, depth, dtype=np.float64):
     return locate(position, normal, normal, matrix)
 
 
+def ask(shadow_map, column, row, depth, filter):
+    """Visibility at a few places; as many are asked as elsewhere, so that programs are shared."""
+    places = (np.resize(x, 300) for x in (column, row, depth))
+    return look(shadow_map, receivers(*places), filter)[: len(column)]
+
+
 def random_places(count=300, beyond=2.0):
     """Places in the map and up to ``beyond`` texels outside of it."""
     rng = np.random.default_rng(1)
@@ -91,7 +97,11 @@ def random_places(count=300, beyond=2.0):
 # Known answers
 
 
-@pytest.mark.parametrize("name", FILTERS)
+PRECISIONS = [(name, np.float64) for name in FILTERS]
+PRECISIONS += [(name, np.float32) for name in ("vsm", "esm", "evsm4", "msm")]
+
+
+@pytest.mark.parametrize(("name", "dtype"), PRECISIONS)
 def test_against_the_oracle(name, dtype):
     column, row, depth = random_places()
     shadow_map, filter = random_map(dtype), FILTERS[name]
@@ -145,7 +155,7 @@ def test_linear_depth():
 
 
 @pytest.mark.parametrize("blur", ["box", "gaussian"])
-@pytest.mark.parametrize("radius", range(6))
+@pytest.mark.parametrize("radius", [0, 1, 2, 5])
 def test_blur_of_one_texel(radius, blur):
     """Its weights sum to 1, fall from the middle, and reach as far as the radius says."""
     size = 16
@@ -190,7 +200,7 @@ def test_bias_moves_the_receiver(name):
 
 # Outside nothing is known to block.
 
-BLOCKED = ShadowMap(jnp.zeros((HEIGHT, WIDTH)), jnp.eye(4))
+BLOCKED = ShadowMap(jnp.zeros((HEIGHT, WIDTH), float), jnp.eye(4))
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -198,8 +208,8 @@ def test_outside_the_image_is_lit(name):
     far = 1e12  # no integer holds that
     column = np.array([-0.5, WIDTH + 0.5, 4.5, 4.5, -far, far, 8.0])
     row = np.array([4.5, 4.5, -1.0, HEIGHT + 1, 3.0, far, 8.0])
-    at = receivers(column, row, np.full(7, 0.5))
-    lit = look(BLOCKED, at, KINDS[name](min_variance=0.0) if "v" in name else KINDS[name]())
+    exact = {"min_variance": 0.0} if "v" in name else {}
+    lit = ask(BLOCKED, column, row, np.full(7, 0.5), KINDS[name](**exact))
     assert_close(lit[:6], np.ones(6), ulps=0)
     assert float(lit[6]) < 1e-6
 
@@ -207,30 +217,29 @@ def test_outside_the_image_is_lit(name):
 @pytest.mark.parametrize("name", KINDS)
 def test_border_is_that_of_the_bilinear_filter(name):
     column = np.array([0.5, 0.25, 0.0, -0.25, -0.5, WIDTH - 0.25, WIDTH])
-    at = receivers(column, np.full(7, 6.5), np.full(7, 0.9))
-    np.testing.assert_allclose(
-        look(BLOCKED, at, KINDS[name]()), look(BLOCKED, at, BilinearFilter()), atol=1e-3
-    )
+    place = column, np.full(7, 6.5), np.full(7, 0.9)
+    found, expected = (ask(BLOCKED, *place, filter) for filter in (KINDS[name](), BilinearFilter()))
+    np.testing.assert_allclose(found, expected, atol=1e-3)
 
 
 @pytest.mark.parametrize("name", KINDS)
 def test_beyond_the_depths_of_the_map_is_lit(name):
-    at = receivers(np.full(3, 5.0), np.full(3, 5.0), np.array([-0.01, 0.5, 1.01]))
-    np.testing.assert_allclose(look(BLOCKED, at, KINDS[name]()), [1, 0, 1], atol=1e-3)
+    middle, depth = np.full(3, 5.0), np.array([-0.01, 0.5, 1.01])
+    found = ask(BLOCKED, middle, middle, depth, KINDS[name]())
+    np.testing.assert_allclose(found, [1, 0, 1], atol=1e-3)
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_empty_map_is_lit(name, dtype):
-    empty = ShadowMap(jnp.ones((HEIGHT, WIDTH), dtype), jnp.eye(4, dtype=dtype))
-    filter = jax.tree.map(lambda x: jnp.asarray(x, dtype), KINDS[name]())
-    lit = look(empty, receivers(*random_places(), dtype=dtype), filter)
+def test_empty_map_is_lit(name):
+    empty = ShadowMap(jnp.ones((HEIGHT, WIDTH), float), jnp.eye(4))
+    lit = look(empty, receivers(*random_places()), KINDS[name]())
     np.testing.assert_allclose(lit, np.ones(300), atol=3e-7)  # measured 1.3e-7, MSM's bias
 
 
 # Laws
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", ["vsm", "evsm4"])
 def test_reading_serves_while_only_depth_moves(name):
     filter, receiver = KINDS[name](), receivers(*random_places())
     kept = filter.read(filter.prepare(random_map()), receiver)
@@ -240,7 +249,7 @@ def test_reading_serves_while_only_depth_moves(name):
         assert_close(found, look(random_map(), biased, filter), ulps=1e4)
 
 
-@pytest.mark.parametrize("name", ["vsm", "esm gaussian", "msm mips"])
+@pytest.mark.parametrize("name", ["vsm mips", "esm gaussian"])
 def test_each_point_is_read_in_its_own_map(name):
     """Blurred apart, read apart: as if each map were the only one."""
     filter, places = FILTERS[name], random_places()
@@ -259,7 +268,7 @@ def test_each_point_is_read_in_its_own_map(name):
     assert float(jnp.abs(alone[0] - alone[1]).max()) > 0.1
 
 
-@pytest.mark.parametrize("name", FILTERS)
+@pytest.mark.parametrize("name", ["vsm mips", "esm gaussian"])
 def test_transposed_map_transposed_places(name):
     column, row, depth = random_places()
     square, filter = random_map().depth[:, :HEIGHT], FILTERS[name]
@@ -312,8 +321,9 @@ def plane_map(size=32, slope=(0.012, 0.007)):
     return ShadowMap(jnp.asarray(of(column, row)), jnp.eye(4)), receiver
 
 
-@pytest.mark.parametrize("blur", ["box", "gaussian"])
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize(
+    ("name", "blur"), [(name, "box") for name in KINDS] + [("vsm", "gaussian")]
+)
 def test_a_plane_does_not_shade_itself(name, blur):
     """Means see to that themselves; sharper bounds want the bias of the reach."""
     shadow_map, receiver = plane_map()

@@ -434,8 +434,8 @@ def test_silhouette_of_a_cube_seen_from_a_corner_is_a_hexagon():
     runs = np.asarray(silhouette(edges, turned))
     assert sorted(np.abs(runs)) == 12 * [0] + 6 * [2]
     ends = np.asarray(edges.vertices)[runs != 0]
-    for corner in (cube.positions[ends[:, 0]], cube.positions[ends[:, 1]]):
-        assert not np.any(np.abs(corner @ [3.0, 4.0, 5.0]) == 12)  # neither nearest nor farthest
+    for corner in np.asarray(cube.positions)[ends.ravel()]:
+        assert abs(np.dot(corner, [3.0, 4.0, 5.0])) < 12  # neither the nearest nor the farthest
     # Each run continues the one before: at every corner as many arrive as leave.
     flow = np.zeros(len(cube.positions), int)
     np.add.at(flow, ends[:, 0], -runs[runs != 0])
