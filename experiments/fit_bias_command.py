@@ -85,7 +85,7 @@ def fit(
     check_folder(out)
     check_size("--image-size", *image_size)
     check_size("--shadow-map-size", shadow_map_size)
-    terms = CombinedBias(parse_techniques(Bias, bias, option="--bias"))
+    terms = CombinedBias(parse_techniques(Bias, bias or (), option="--bias"))
     lookup, comparison = parse_lookup(filter, compare)
     check_techniques(terms, lookup)
     free_numbers(terms, free or None, filter=lookup, compare=comparison)
@@ -135,7 +135,7 @@ def fit(
         pictures.write_comparison({**errors, "too_large": study.errors(large)})
         _write_curve(study, fitted, errors, out)
     settings = {
-        "scene": scene, "target": None if target is None else str(target), "bias": list(bias),
+        "scene": scene, "target": None if target is None else str(target), "bias": list(bias or ()),
         "filter": list(filter), "compare": list(compare), "layout": list(layout),
         "image_size": list(image_size), "shadow_map_size": shadow_map_size,
         "shading": list(shading),

@@ -67,7 +67,7 @@ def render(
     image_size: ImageSize = (512, 512),
     shadow_map_size: MapSize = 1024,
     layout: LayoutWords = (),
-    bias: BiasWords | None = None,
+    bias: BiasWords = None,
     compare: CompareWords = (),
     filter: FilterWords = ("bilinear",),
     shading: ShadingWords = ("blinn-phong",),

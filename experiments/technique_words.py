@@ -17,7 +17,7 @@ from .options import describe, parse_technique, parse_techniques
 from .scene import Scene
 
 BiasWords = Annotated[
-    tuple[str, ...],
+    tuple[str, ...] | None,
     tyro.conf.arg(
         metavar="NAME[=VALUE]",
         help="Biases, one after another; no word for no bias. " + "; ".join(describe(Bias)) + ".",

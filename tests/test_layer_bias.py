@@ -135,7 +135,7 @@ def test_contacts_leak_within_the_reach():
     """
     light, mesh, filter = LIGHTS["parallel"], contact(), PCFFilter(2)
     points, normals, away = shadowed_floor()
-    lit = {}
+    lit, texels = {}, away
     for name, bias in {**LAYERS, "adaptive": AdaptiveBias()}.items():
         shadow_map = layers(mesh, light, bias.casters)
         receiver = located(points, normals, light, shadow_map)

@@ -150,7 +150,7 @@ def test_degenerate_points_have_finite_derivatives(name):
     of, _, pull = compiled(name)
     bad = {}
     for stored in (0.0, 0.5, 1.0):
-        leaves = generic_leaves(name) | {"length": jnp.asarray(0.0)}
+        leaves = generic_leaves(name) | {"length": jnp.zeros(())}
         half = leaves["depths"].at[:, ::2].set(1.0)
         leaves["depths"] = half if stored == 0.5 else jnp.full_like(half, stored)
         for row, position in enumerate(points.values()):

@@ -244,7 +244,7 @@ def test_a_fit_finds_the_light_s_size():
     scene = edge_scene()
     lit = lambda size: _look(*scene, PCSSFilter(size, **FINE), AdaptiveBias())
     step = jax.jit(lambda size: jax.jvp(lit, (size,), (jnp.ones_like(size),)))
-    size = jnp.asarray(0.08)
+    size = slope = jnp.asarray(0.08)
     for _ in range(10):
         value, slope = step(size)
         size = size + slope @ (truth(0.2) - value) / (slope @ slope)

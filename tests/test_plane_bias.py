@@ -308,7 +308,7 @@ def test_a_constant_bias_adds_to_the_plane():
 # Which bias goes with which filter
 
 
-class Blur(Filter):
+class BlurFilter(Filter):
     """A filter that compares nothing, like those of means."""
 
     compares = False
@@ -324,7 +324,7 @@ class Blur(Filter):
 
 
 def test_default_bias_follows_the_plane_for_wide_filters():
-    for filter in (NearestFilter(), BilinearFilter(), Blur()):
+    for filter in (NearestFilter(), BilinearFilter(), BlurFilter()):
         assert default_bias(filter) == AnalyticBias()
     for filter in (PCFFilter(0), PCFFilter(2), TentFilter(), PoissonFilter(), PCSSFilter()):
         assert default_bias(filter) == AdaptiveBias()
@@ -345,13 +345,15 @@ def test_following_the_plane_wants_comparisons():
         for filter in FILTERS.values():
             check_techniques(bias, filter)
         named = type(bias.terms[1] if isinstance(bias, CombinedBias) else bias).__name__
-        with pytest.raises(ValueError, match=f"^bias: {named} compares texel by texel, .* Blur "):
-            check_techniques(bias, Blur())
+        with pytest.raises(
+            ValueError, match=f"^bias: {named} compares texel by texel, .* BlurFilter "
+        ):
+            check_techniques(bias, BlurFilter())
     for bias in (CombinedBias(), SlopeBias(), NormalOffsetBias(), MidpointBias(), AnalyticBias()):
-        check_techniques(bias, Blur())
+        check_techniques(bias, BlurFilter())
 
 
 def test_several_culprits_are_named():
     both = CombinedBias((AdaptiveBias(), SlopeBias(), ReceiverPlaneBias()))
     with pytest.raises(ValueError, match="AdaptiveBias and ReceiverPlaneBias compares"):
-        check_techniques(both, Blur())
+        check_techniques(both, BlurFilter())
