@@ -36,9 +36,9 @@ lint: style ## check form and types (pyright fetches itself with npm)
 
 bench: $(VENV)/run.stamp ## time the stages (leave the machine alone), into results/bench.json
 	@mkdir -p results
-	$(BIN)/python -m experiments.bench --out results/bench.json
-	$(BIN)/python -m experiments.bench_frames --out results/frames.json
-	$(BIN)/python -m experiments.bench_normal_map --out results/normal_map.json
+	$(BIN)/python -m experiments.benchmarks.stages --out results/bench.json
+	$(BIN)/python -m experiments.benchmarks.frames --out results/frames.json
+	$(BIN)/python -m experiments.benchmarks.normal_maps --out results/normal_map.json
 
 notebooks: $(VENV)/test.stamp ## execute the notebooks in place
 	$(BIN)/jupyter-execute --inplace notebooks/*.ipynb

@@ -31,11 +31,11 @@ def _run(arguments: Sequence[str]) -> int:
     # Loaded here, so that an interrupt while they load, which takes seconds, ends well too.
     import jax
 
-    from .bake_command import bake
-    from .bake_light_command import bake as bake_light
-    from .fit_bias_command import fit as fit_bias
-    from .fit_normal_map_command import fit as fit_normal_map
-    from .render_command import render
+    from .baking.bake_command import bake
+    from .baking.bake_light_command import bake as bake_light
+    from .bias_fits.fit_bias_command import fit as fit_bias
+    from .normal_map_fits.fit_normal_map_command import fit as fit_normal_map
+    from .rendering.render_command import render
 
     commands = {
         "render": render,

@@ -8,7 +8,7 @@ import matplotlib.patches
 import numpy as np
 from jaxtyping import Bool, Float
 
-from .images import atomic_path, linear_to_srgb
+from .files.images import atomic_path, linear_to_srgb
 
 ACNE_COLOR = "#e69f00"  # light orange: truth lit, method dark
 LEAK_COLOR = "#0072b2"  # dark blue: truth dark, method lit

@@ -17,7 +17,7 @@ distance of texels, while a pixel of ``f`` texels covers ``f^2 / 12``. So of the
 the share ``f^2 / (f^2 + 2)`` counts, which is 1 from afar. Against supersampling that leaves a
 quarter to a third of the error where a pixel is half a texel wide, and nowhere adds more than
 a twentieth. The moments of slopes that LEAN mapping keeps, reduced to one exponent, gave the
-same errors within 6 % on average, for more texels: ``experiments/normal_mips_error.py``.
+same errors within 6 % on average, for more texels: ``experiments/benchmarks/normal_mips.py``.
 
 References:
     M. Toksvig, "Mipmapping Normal Maps", Journal of Graphics Tools 10(3), 2005. M. Olano and

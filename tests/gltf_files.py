@@ -7,7 +7,7 @@ import struct
 import numpy as np
 from PIL import Image
 
-from experiments.gltf import load_gltf
+from experiments.files.gltf import load_gltf
 
 CODES = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "u4": 5125, "f4": 5126}
 TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}

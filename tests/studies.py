@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from experiments.bias_study import Study, Trial, prepare_study
+from experiments.bias_fits.bias_study import Study, Trial, prepare_study
 from experiments.scene import Scene
 from experiments.scenes import load_scene
 from shadows.bias import CombinedBias, ConstantBias, SlopeBias

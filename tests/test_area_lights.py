@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from experiments.truth import Occluders, trace_visibility
-from experiments.truth_area import area_visibility
+from experiments.truth.area import area_visibility
+from experiments.truth.rays import Occluders, trace_visibility
 from shadows import (
     DiscLight,
     HardCompare,

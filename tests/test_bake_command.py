@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import experiments.bake_command
-from experiments.bake_command import bake
-from experiments.bake_pictures import render_bake
-from experiments.images import read_exr
-from experiments.map_files import read_normal_map
-from experiments.mesh_file import load_scene_file
+import experiments.baking.bake_command
+from experiments.baking.bake_command import bake
+from experiments.baking.bake_pictures import render_bake
+from experiments.files.images import read_exr
+from experiments.files.map_files import read_normal_map
+from experiments.files.mesh_file import load_scene_file
 from tangentspace.shapes import plane, uv_sphere
 
 SMALL = {"size": 32, "samples": 1}
@@ -44,12 +44,12 @@ def contents(folder):
 
 
 def paths(*names):
-    return [experiments.bake_command.Path(name) for name in names]
+    return [experiments.baking.bake_command.Path(name) for name in names]
 
 
 def test_the_map_and_the_pictures_are_written(folder, monkeypatch, capsys):
     small = functools.partial(render_bake, image_size=(48, 48))
-    monkeypatch.setattr(experiments.bake_command, "render_bake", small)
+    monkeypatch.setattr(experiments.baking.bake_command, "render_bake", small)
     out, pictures = paths("map.png", "made/here")
     bake(*paths("high.obj", "low.obj"), out=out, pictures=pictures, **SMALL)
     assert contents(folder) == [
@@ -82,7 +82,7 @@ def test_an_exr_holds_what_a_png_rounds(folder):
 
 
 def test_the_floor_of_a_scene_is_no_part_of_the_mesh(folder):
-    mesh = experiments.bake_command._load_mesh(paths("low.obj")[0])
+    mesh = experiments.baking.bake_command._load_mesh(paths("low.obj")[0])
     assert len(mesh.faces) < len(load_scene_file("low.obj").mesh.faces)
     sphere = uv_sphere(rings=12, segments=24)
     assert mesh.faces.shape == sphere.faces.shape

@@ -4,9 +4,9 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.bake_cage import Detail, find_cage
-from experiments.bake_normals import bake_normals
-from experiments.smooth_normals import smooth_normals
+from experiments.baking.bake_cage import Detail, find_cage
+from experiments.baking.bake_normals import bake_normals
+from experiments.files.smooth_normals import smooth_normals
 from tangentspace.mesh import Mesh
 from tangentspace.mikktspace import with_tangents
 from tangentspace.normal_map import decode_normals

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.truth import Occluders, trace_visibility
+from experiments.truth.rays import Occluders, trace_visibility
 from shadows import (
     AdaptiveBias,
     CascadesLayout,

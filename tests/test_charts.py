@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-import experiments.charts
-from experiments.charts import bands, draw, lay_out, shared_texels
+import experiments.baking.charts
+from experiments.baking.charts import bands, draw, lay_out, shared_texels
 from tangentspace.mesh import Mesh
 from tangentspace.shapes import merge, plane
 
@@ -68,7 +68,7 @@ def test_a_triangle_covers_the_texels_whose_centres_it_holds():
 def test_bands_are_parts_of_one_picture(monkeypatch):
     mesh = with_uvs(plane(segments=3), factor=(0.91, 0.83), shift=(0.03, 0.03))
     whole = list(drawn(mesh))  # no texel's centre lies on an edge, where rounding decides
-    monkeypatch.setattr(experiments.charts, "_BAND", 5 * SIZE)
+    monkeypatch.setattr(experiments.baking.charts, "_BAND", 5 * SIZE)
     assert [band.top for band in bands(SIZE)] == [0, 5, 10, 15]
     for got, expected in zip(drawn(mesh), whole, strict=True):
         assert_close(got, expected, ulps=8)  # measured 1

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-import experiments.fit_bias_command
-import experiments.render_command
+import experiments.bias_fits.fit_bias_command as fit_bias_command
+import experiments.rendering.render_command as render_command
 from experiments.__main__ import main
 from experiments.console import say_table, stage
-from experiments.images import read_exr, read_image, write_exr, write_png
+from experiments.files.images import read_exr, read_image, write_exr, write_png
 from experiments.scenes import EMBEDDED
 from shadows.appearance import Appearance
 from shadows.bias import CombinedBias, ConstantBias, SlopeBias
@@ -250,7 +250,7 @@ def test_a_fit_to_a_picture_is_judged_by_the_picture(run, monkeypatch, tmp_path)
     known = CombinedBias((ConstantBias(0.005), SlopeBias(1.5)))
     with jax.enable_x64(False):
         write_png(tmp_path / "target.png", box.picture(box.visibility(known)))
-    monkeypatch.setattr(experiments.fit_bias_command, "load_scene", lambda name: box.scene)
+    monkeypatch.setattr(fit_bias_command, "load_scene", lambda name: box.scene)
     sizes = ["--image-size", *map(str, IMAGE_SIZE), "--shadow-map-size", str(MAP_SIZE)]
     code, out, err = run("fit-bias", "thin-box", "--target", "target.png", "--out", "made", *sizes)
     assert code == 0, err
@@ -281,7 +281,7 @@ def seen(monkeypatch):
             shadow_map = ShadowMap(jnp.full((64, 64), depth), jnp.eye(4))
             dark = (jnp.zeros((64, 48)),)
             image = Rendering(empty, dark, surface, Appearance(empty), (shadow_map,))
-        monkeypatch.setattr(experiments.render_command, "render_scene", lambda *_, **__: image)
+        monkeypatch.setattr(render_command, "render_scene", lambda *_, **__: image)
 
     return seen
 
@@ -430,7 +430,7 @@ def test_what_goes_wrong_on_the_way_is_one_line(run, monkeypatch, tmp_path, rais
     def fail(*args, **kwargs):
         raise raised
 
-    monkeypatch.setattr(experiments.fit_bias_command, "prepare_study", fail)
+    monkeypatch.setattr(fit_bias_command, "prepare_study", fail)
     found, out, err = run("fit-bias", "--out", "made", *SMALL)
     assert (found, out) == (code, "")
     assert says in err.splitlines()[-1]
@@ -442,7 +442,7 @@ def test_a_fault_of_ours_keeps_its_traceback(run, monkeypatch):
     def fail(*args, **kwargs):
         raise jax.errors.JaxRuntimeError("INTERNAL: broken")
 
-    monkeypatch.setattr(experiments.render_command, "render_scene", fail)
+    monkeypatch.setattr(render_command, "render_scene", fail)
     with pytest.raises(jax.errors.JaxRuntimeError, match="INTERNAL"):
         run("render", "--out", "a.png")
 
@@ -482,8 +482,8 @@ def test_the_commands_of_the_readme_are_understood():
     commands = re.findall(r"python -m experiments ((?:render|fit-bias) [^`\n]*)", text)
     assert len(commands) >= 4
     from experiments.__main__ import _parse
-    from experiments.fit_bias_command import fit
-    from experiments.render_command import render
+    from experiments.bias_fits.fit_bias_command import fit
+    from experiments.rendering.render_command import render
 
     for command in commands:
         _parse(command.split(), {"render": render, "fit-bias": fit})

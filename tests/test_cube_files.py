@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments.cube_files import read_cube_map
-from experiments.images import write_exr, write_png
+from experiments.files.cube_files import read_cube_map
+from experiments.files.images import write_exr, write_png
 
 NAMES = {
     "short": "px nx py ny pz nz",

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from experiments.dilate import dilate
+from experiments.baking.dilate import dilate
 
 
 def numbered(height, width):

@@ -7,15 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import experiments.fit_bias
-from experiments.bias_space import BiasSpace, soft_residual
-from experiments.bias_study import ImageGoal, TruthGoal, with_target
-from experiments.fit_bias import fit_bias
-from experiments.images import read_image, write_exr, write_png
+import experiments.bias_fits.fit_bias
+from experiments.bias_fits.bias_space import BiasSpace, soft_residual
+from experiments.bias_fits.bias_study import ImageGoal, TruthGoal, with_target
+from experiments.bias_fits.fit_bias import fit_bias
+from experiments.bias_fits.sweep_bias import sweep_bias
+from experiments.files.images import read_image, write_exr, write_png
 from experiments.metrics import shadow_errors
 from experiments.scene import Material, Scene
 from experiments.scenes import SHADOW_SCENES
-from experiments.sweep_bias import sweep_bias
 from shadows.bias import CombinedBias, ConstantBias, NormalOffsetBias, SlopeBias
 from shadows.compare import HardCompare
 from shadows.filters import NearestFilter
@@ -344,7 +344,7 @@ def test_the_residual_is_traced_once_for_all_levels(monkeypatch):
         traces.append(args)
         return soft_residual(*args)
 
-    monkeypatch.setattr(experiments.fit_bias, "soft_residual", counted)
+    monkeypatch.setattr(experiments.bias_fits.fit_bias, "soft_residual", counted)
     trial = thinned(study("default").trial, 301)  # a shape that no other test compiles
     fit_bias(trial, BOTH, LINEAR, levels=(1.0,))
     once = len(traces)

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import experiments.fit_normal_map
-from experiments.fit_normal_map import MapFit, objective
-from experiments.normal_map_evidence import gather_evidence, undetermined
-from experiments.normal_map_information import to_texels
-from experiments.normal_map_study import (
+import experiments.normal_map_fits.fit_normal_map
+from experiments.normal_map_fits.fit_normal_map import MapFit, objective
+from experiments.normal_map_fits.normal_map_evidence import gather_evidence, undetermined
+from experiments.normal_map_fits.normal_map_information import to_texels
+from experiments.normal_map_fits.normal_map_study import (
     MapStudy,
     angles,
     errors_of,
@@ -22,9 +22,9 @@ from experiments.normal_map_study import (
     mapped_material,
     texels_of,
 )
-from experiments.normal_map_task import Task, Unknowns, free_leaves, free_names
-from experiments.prepare_scene import prepare_scene
-from experiments.relief import shadowed_relief
+from experiments.normal_map_fits.normal_map_task import Task, Unknowns, free_leaves, free_names
+from experiments.rendering.prepare_scene import prepare_scene
+from experiments.scenes.relief import shadowed_relief
 from shadows.lights import DirectionalLight, PointLight, SpotLight
 from tangentspace.normal_map import (
     decode_normals,
@@ -351,7 +351,7 @@ def test_the_objective_is_traced_once_whatever_the_steps(monkeypatch):
         traces.append(args)
         return objective(*args)
 
-    monkeypatch.setattr(experiments.fit_normal_map, "objective", counted)
+    monkeypatch.setattr(experiments.normal_map_fits.fit_normal_map, "objective", counted)
     _, fit = begin("colors")
     fit.advance(1)
     assert fit.converged is False

@@ -16,15 +16,15 @@ import pytest
 from PIL import Image
 
 import experiments.checks
-import experiments.fit_normal_map_command as command
+import experiments.normal_map_fits.fit_normal_map_command as command
 from experiments.__main__ import main
-from experiments.images import read_exr, write_exr, write_png
-from experiments.map_files import read_normal_map
-from experiments.normal_map_study import angles
-from experiments.normal_map_views import see_map
-from experiments.prepare_scene import prepare_scene
-from experiments.relief import shadowed_relief
+from experiments.files.images import read_exr, write_exr, write_png
+from experiments.files.map_files import read_normal_map
+from experiments.normal_map_fits.normal_map_study import angles
+from experiments.normal_map_fits.normal_map_views import see_map
+from experiments.rendering.prepare_scene import prepare_scene
 from experiments.scenes import load_scene
+from experiments.scenes.relief import shadowed_relief
 from shadows import shade, surface_appearance
 from tangentspace.shading import LambertShading, PhongShading
 from tangentspace.texture import clamp

@@ -4,9 +4,9 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.bias_space import free_numbers
-from experiments.bias_study import prepare_study, with_target
-from experiments.fit_bias import fit_bias
+from experiments.bias_fits.bias_space import free_numbers
+from experiments.bias_fits.bias_study import prepare_study, with_target
+from experiments.bias_fits.fit_bias import fit_bias
 from experiments.scenes import load_scene
 from shadows import (
     AdaptiveBias,

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.framing import frame_mesh, framing_camera
+from experiments.files.framing import frame_mesh, framing_camera
 from shadows.transforms import PerspectiveCamera, transform_points
 from tangentspace.shapes import icosphere, plane, torus
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from experiments.gltf import load_gltf
-from experiments.mesh_file import load_scene_file
+from experiments.files.gltf import load_gltf
+from experiments.files.mesh_file import load_scene_file
 from tangentspace.shapes import icosphere, torus
 
 from .gltf_files import SHEET, SHEET_FACES, Builder, indices, quaternion, sheet_scene

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from experiments.gltf import load_gltf
+from experiments.files.gltf import load_gltf
 from experiments.scene import Material
 from tangentspace.mikktspace import with_tangents
 from tangentspace.normal_map import decode_normals

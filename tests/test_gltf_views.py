@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.gltf import load_gltf
+from experiments.files.gltf import load_gltf
 from shadows.lights import DirectionalLight, PointLight, SpotLight
 from shadows.transforms import OrthographicCamera, PerspectiveCamera
 

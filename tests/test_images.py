@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 from PIL import Image
 
-from experiments.images import (
+from experiments.files.images import (
     atomic_path,
     linear_to_srgb,
     read_exr,

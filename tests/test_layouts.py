@@ -9,7 +9,7 @@ import pytest
 from jax.test_util import check_grads
 
 from experiments.options import techniques
-from experiments.truth import Occluders, trace_visibility
+from experiments.truth.rays import Occluders, trace_visibility
 from shadows import (
     AdaptiveBias,
     CascadesLayout,

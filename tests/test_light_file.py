@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from experiments.light_file import read_lights
+from experiments.files.light_file import read_lights
 from shadows import DirectionalLight
 
 from .tools import assert_close

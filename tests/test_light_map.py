@@ -5,16 +5,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.bake_light import (
+from experiments.baking.bake_light import (
     bake_light_map,
     read_light_map,
     unwrap_scene,
     write_light_map,
 )
-from experiments.light_map_uvs import light_map_uvs
-from experiments.render_scene import render_light_map, render_scene
+from experiments.baking.light_map_uvs import light_map_uvs
+from experiments.rendering.render_scene import render_light_map, render_scene
 from experiments.scene import Material, Scene
-from experiments.truth import Occluders, trace_visibility
+from experiments.truth.rays import Occluders, trace_visibility
 from shadows import (
     Appearance,
     BilinearFilter,

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments.images import linear_to_srgb, write_exr
-from experiments.map_files import (
+from experiments.files.images import linear_to_srgb, write_exr
+from experiments.files.map_files import (
     bump_map,
     read_color_map,
     read_height_map,
     read_normal_map,
     write_normal_map,
 )
-from experiments.texture_file import Pixels
+from experiments.files.texture_file import Pixels
 from tangentspace.texture import clamp, repeat
 
 from .test_images import png_16_bit

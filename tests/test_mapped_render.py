@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.prepare_scene import prepare_scene
-from experiments.render_scene import render_scene, shade_scene
+from experiments.rendering.prepare_scene import prepare_scene
+from experiments.rendering.render_scene import render_scene, shade_scene
 from experiments.scenes import load_scene
 from shadows import (
     Appearance,

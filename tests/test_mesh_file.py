@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments.mesh_file import load_scene_file
-from experiments.smooth_normals import smooth_normals
+from experiments.files.mesh_file import load_scene_file
+from experiments.files.smooth_normals import smooth_normals
 from tangentspace.shapes import icosphere, torus
 from tangentspace.vertex_normals import vertex_normals
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from experiments.metrics import ShadowErrors, contact_gap, shadow_errors
-from experiments.truth import Occluders, nearest_occluder_distance, trace_visibility
+from experiments.truth.rays import Occluders, nearest_occluder_distance, trace_visibility
 from shadows.lights import DirectionalLight
 
 from .tools import assert_close

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments.images import write_exr
-from experiments.mesh_file import load_scene_file
-from experiments.mtl import load_materials, read_mtl
+from experiments.files.images import write_exr
+from experiments.files.mesh_file import load_scene_file
+from experiments.files.mtl import load_materials, read_mtl
 from experiments.scene import Material
 from tangentspace.texture import Texture, clamp, repeat
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from jax.test_util import check_grads
 
-from experiments.normal_mips_error import STYLES, bump_maps, relative_errors
+from experiments.benchmarks.normal_mips import STYLES, bump_maps, relative_errors
 from tangentspace.lighting import blinn_phong
 from tangentspace.mips import sample_trilinear
 from tangentspace.normal_filtering import build_normal_mips, mean_length, toksvig_gloss

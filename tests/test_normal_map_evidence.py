@@ -8,9 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.normal_map_evidence import gather_evidence, seen_texels, undetermined
-from experiments.normal_map_information import texel_information, to_texels
-from experiments.normal_map_task import Task, Unknowns
+from experiments.normal_map_fits.normal_map_evidence import (
+    gather_evidence,
+    seen_texels,
+    undetermined,
+)
+from experiments.normal_map_fits.normal_map_information import texel_information, to_texels
+from experiments.normal_map_fits.normal_map_task import Task, Unknowns
 from shadows.lights import DirectionalLight
 from tangentspace.normal_map import normals_from_slopes
 from tangentspace.shading import LambertShading, PhongShading

@@ -10,8 +10,8 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-import experiments.normal_map_solver
-from experiments.normal_map_solver import Solve
+import experiments.normal_map_fits.normal_map_solver as solver
+from experiments.normal_map_fits.normal_map_solver import Solve
 
 SOLVER = optx.LBFGS(rtol=1e-5, atol=1e-5)
 MATRIX = np.array([[3.0, 1.0, 0.2], [1.0, 2.0, -0.4], [0.2, -0.4, 1.5]], np.float32)
@@ -254,7 +254,7 @@ def test_a_file_is_whole_or_as_it_was(tmp_path, monkeypatch, trouble):
         target.write_bytes(whole[: len(whole) // 2])
         raise trouble("stopped")
 
-    monkeypatch.setattr(experiments.normal_map_solver.eqx, "tree_serialise_leaves", halfway)
+    monkeypatch.setattr(solver.eqx, "tree_serialise_leaves", halfway)
     with pytest.raises((trouble, ValueError)):
         solve.store(path)
     assert path.read_bytes() == whole

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from experiments.normal_map_task import Task, Unknowns
-from experiments.normal_map_views import View, see_map
+from experiments.normal_map_fits.normal_map_task import Task, Unknowns
+from experiments.normal_map_fits.normal_map_views import View, see_map
 from experiments.scene import Material, Scene
 from shadows import shade, surface_appearance
 from shadows.lights import DirectionalLight, PointLight, SpotLight

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from experiments.prepare_scene import prepare_scene
+from experiments.rendering.prepare_scene import prepare_scene
 from experiments.scene import Material, Scene
 from experiments.scenes import load_scene
 from shadows import DirectionalLight, PerspectiveCamera, look_at

@@ -4,9 +4,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.relief import relief, relief_texels, shadowed_relief
 from experiments.scenes import load_scene
-from experiments.truth import Occluders, trace_visibility
+from experiments.scenes.relief import relief, relief_texels, shadowed_relief
+from experiments.truth.rays import Occluders, trace_visibility
 from shadows.lights import DirectionalLight
 from shadows.transforms import transform_points
 from tangentspace.texture import clamp

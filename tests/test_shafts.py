@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from experiments.truth import Occluders
-from experiments.truth_shafts import trace_shafts
+from experiments.truth.rays import Occluders
+from experiments.truth.shafts import trace_shafts
 from shadows import (
     CubeLayout,
     DirectionalLight,

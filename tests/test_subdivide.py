@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from experiments.subdivide import subdivide
+from experiments.files.subdivide import subdivide
 from tangentspace import shapes
 from tangentspace.mesh import Mesh
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from experiments.__main__ import main
-from experiments.images import read_exr
+from experiments.files.images import read_exr
 from experiments.options import describe
 from shadows import Filter, Tap, TapFilter
 from shadows.filters import fetch

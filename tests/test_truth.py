@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from experiments.truth import Occluders, nearest_occluder_distance, trace_visibility
+from experiments.truth.rays import Occluders, nearest_occluder_distance, trace_visibility
 from shadows.lights import DirectionalLight, PointLight, SpotLight
 
 DOWN = np.array([0.0, -1.0, 0.0])

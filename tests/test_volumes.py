@@ -15,7 +15,7 @@ import pytest
 import scipy.ndimage
 
 from experiments.scenes import load_scene
-from experiments.truth import Occluders, trace_visibility
+from experiments.truth.rays import Occluders, trace_visibility
 from shadows import (
     DirectionalLight,
     Light,

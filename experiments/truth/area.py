@@ -1,0 +1,45 @@
+"""Ray-traced soft shadows: the share of an area light that each surface point sees."""
+
+import numpy as np
+from jaxtyping import Float
+
+from shadows.area_lights import AreaLight
+from shadows.lights import PointLight
+
+from .rays import FaceIds, Occluders, Vectors, trace_visibility
+
+
+def area_visibility(
+    positions: Vectors,
+    geometric_normals: Vectors,
+    face_ids: FaceIds,
+    light: AreaLight,
+    occluders: Occluders,
+    *,
+    samples: int,
+) -> Float[np.ndarray, "*image"]:
+    """Return the share of the light's area that each surface point sees, by a ray to each sample.
+
+    Args:
+        positions: World space; read only where there is a surface.
+        geometric_normals: Unit normals of the faces (not the shading normals), on the side
+            that is looked at; what lies behind a surface it does not see.
+        face_ids: The face that each point lies on, an index into the occluders' faces; -1
+            where there is no surface.
+        light: The light. Both of its sides count; that one is dark is told by its radiance.
+        occluders: The same mesh, prepared.
+        samples: Points of the light, ``light.sample_points(samples)``.
+
+    Returns:
+        Shares in [0, 1], whole multiples of 1 / samples; 0 where there is no surface.
+
+    Raises:
+        ValueError: If ``samples`` is less than 1, the shapes do not fit each other, or a
+            face does not exist.
+    """
+    points = np.asarray(light.sample_points(samples))
+    seen = np.zeros(np.shape(face_ids))
+    for point in points:
+        lamp = PointLight(point)
+        seen += trace_visibility(positions, geometric_normals, face_ids, lamp, occluders)
+    return seen / samples
