@@ -39,6 +39,7 @@ bench: $(VENV)/run.stamp ## time the stages (leave the machine alone), into resu
 	$(BIN)/python -m experiments.benchmarks.stages --out results/bench.json
 	$(BIN)/python -m experiments.benchmarks.frames --out results/frames.json
 	$(BIN)/python -m experiments.benchmarks.normal_maps --out results/normal_map.json
+	$(BIN)/python -m experiments.benchmarks.techniques --out results/techniques.json
 
 notebooks: $(VENV)/test.stamp ## execute the notebooks in place
 	$(BIN)/jupyter-execute --inplace notebooks/*.ipynb

@@ -21,7 +21,8 @@ BiasWords = Annotated[
     tyro.conf.arg(
         metavar="NAME[=VALUE]",
         help="Biases, one after another; no word for no bias. " + "; ".join(describe(Bias)) + ".",
-        help_behavior_hint="(default: analytic; adaptive for filters wider than 2x2 texels)",
+        help_behavior_hint="(default: analytic; adaptive for filters wider than 2x2 texels; "
+        "none for filters that need none)",
     ),
 ]
 CompareWords = Annotated[
@@ -47,6 +48,7 @@ FilterWords = Annotated[
         help="Lookup; its options also as --filter.OPTION VALUE. "
         + "; ".join(describe(Filter))
         + ".",
+        help_behavior_hint="(default: bilinear)",
     ),
 ]
 ShadingWords = Annotated[
@@ -89,7 +91,7 @@ def parse_lookup(filter: Sequence[str], compare: Sequence[str]) -> tuple[Filter,
     Raises:
         ValueError: If they are not understood, or mean nothing to each other.
     """
-    lookup = parse_technique(Filter, filter, option="--filter")
+    lookup = parse_technique(Filter, filter or ["bilinear"], option="--filter")
     if compare and not lookup.compares:
         raise ValueError(f"--compare: --filter {filter[0]} compares no depths; drop one of them")
     return lookup, parse_technique(Compare, compare or ["hard"], option="--compare", least=0.0)

@@ -1,7 +1,7 @@
 """Area lights: discs and rectangles that cast penumbrae.
 
 Shading and the one shadow map take the light from its centre; what its size does to a
-shadow is up to a filter (``PCSSFilter(light_size=2 * radius)``), or to as many maps or rays as
+shadow is up to a filter (``PCSSFilter`` takes it from the light), or to as many maps or rays as
 ``sample_points`` gives points.
 
 They shine to one side, as a sheet of paper lit from behind: what arrives falls with the cosine
@@ -16,8 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from tangentspace._math import dot, safe_normalize
+from tangentspace._math import dot, safe_norm, safe_normalize
 
+from ._checks import check_field
 from .lights import Light, Points, SpotLight
 from .transforms import Scalar, Vector, look_at
 
@@ -37,6 +38,11 @@ class AreaLight(Light):
     position: eqx.AbstractVar[Vector]
     direction: eqx.AbstractVar[Vector]
     color: eqx.AbstractVar[Vector]
+
+    @property
+    @abc.abstractmethod
+    def diameter(self) -> Scalar:
+        """World length: of the disc whose points are as far from its centre, by rms."""
 
     @abc.abstractmethod
     def sample_points(self, count: int) -> Float[Array, "{count} 3"]:
@@ -98,7 +104,12 @@ class DiscLight(AreaLight):
 
     def __check_init__(self) -> None:
         """Refuse a negative radius."""
-        _check_length("DiscLight", "radius", self.radius)
+        check_field(self, "radius", "of at least 0", lambda radius: radius >= 0)
+
+    @property
+    def diameter(self) -> Scalar:
+        """Twice the radius, world length."""
+        return 2 * self.radius
 
     def sample_points(self, count: int) -> Float[Array, "{count} 3"]:
         """Return points on a spiral, each with the same share of the disc's area."""
@@ -129,17 +140,17 @@ class RectangleLight(AreaLight):
 
     def __check_init__(self) -> None:
         """Refuse negative sides."""
-        _check_length("RectangleLight", "width", self.width)
-        _check_length("RectangleLight", "height", self.height)
+        for field in ("width", "height"):
+            check_field(self, field, "of at least 0", lambda length: length >= 0)
+
+    @property
+    def diameter(self) -> Scalar:
+        """World length: of the disc that spreads as far; 1.15 times the side of a square."""
+        sides = jnp.stack([jnp.asarray(self.width), jnp.asarray(self.height)])
+        return np.sqrt(2 / 3) * safe_norm(sides)
 
     def sample_points(self, count: int) -> Float[Array, "{count} 3"]:
         """Return points on a lattice, each with the same share of the rectangle's area."""
         u, v = self._lattice(count)
         width, height = jnp.asarray(self.width), jnp.asarray(self.height)
         return self._placed(self.up, width * (u - 0.5), height * (v - 0.5))
-
-
-def _check_length(name: str, field: str, length: object) -> None:
-    """Refuse a negative length; numbers inside a traced program pass."""
-    if isinstance(length, int | float | np.ndarray | np.number) and not float(length) >= 0:
-        raise ValueError(f"{name}: expected `{field}` of at least 0, got {length}")

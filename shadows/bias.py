@@ -29,6 +29,11 @@ _LENGTHS = {"world": "world length", "texel": "texel widths", "reach": "reaches 
 _GAINS = _LENGTHS | {"texel": "texel footprints"}
 
 
+def length_field(default: float) -> Any:
+    """Return the field of a bias that is a length in one of the units."""
+    return eqx.field(default=default, metadata={"unit": _LENGTHS})
+
+
 def unit_field(default: Unit) -> Any:
     """Return the field of a bias that says what its number is measured in."""
     return eqx.field(static=True, default=default, metadata={"choices": tuple(_LENGTHS)})
@@ -83,7 +88,7 @@ class ConstantBias(Bias):
         unit: Of ``length``; in texels and reaches it grows with the distance from a lamp.
     """
 
-    length: Scalar = eqx.field(default=0.0, metadata={"unit": _LENGTHS})
+    length: Scalar = length_field(0.0)
     unit: Unit = unit_field("world")
 
     def __call__(self, receiver: Receiver, reach: Scalar = 0.5) -> Receiver:
@@ -149,7 +154,7 @@ class NormalOffsetBias(Bias):
     """
 
     reads_anew: ClassVar[bool] = True
-    offset: Scalar = eqx.field(default=1.0, metadata={"unit": _LENGTHS})
+    offset: Scalar = length_field(1.0)
     unit: Unit = unit_field("texel")
 
     def __call__(self, receiver: Receiver, reach: Scalar = 0.5) -> Receiver:

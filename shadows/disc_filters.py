@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ._checks import check_field
 from .compare import Compare
 from .filters import Filter, Tap, compare_taps
 from .shadow_map import Receiver, ShadowMap
@@ -71,18 +72,6 @@ def read_disc(
     return tuple(tap._replace(across=tap.across + across, down=tap.down + down) for tap in taps)
 
 
-def check_taps(name: str, option: str, count: int) -> None:
-    """Refuse a number of taps that is not from 1 to 128."""
-    if isinstance(count, bool) or not isinstance(count, int) or not 1 <= count <= 128:
-        raise ValueError(f"{name}: expected `{option}` from 1 to 128, got {count}")
-
-
-def check_least(name: str, option: str, value: object, least: float) -> None:
-    """Refuse a number below the least; numbers inside a traced program pass."""
-    if isinstance(value, int | float | np.ndarray | np.number) and not float(value) >= least:
-        raise ValueError(f"{name}: expected `{option}` of at least {least:g}, got {value}")
-
-
 class PoissonFilter(Filter):
     """The mean of 2x2 bilinear lookups at points scattered in a disc.
 
@@ -101,8 +90,8 @@ class PoissonFilter(Filter):
 
     def __check_init__(self) -> None:
         """Refuse a negative radius, and numbers of taps out of range."""
-        check_least("PoissonFilter", "radius", self.radius, 0.0)
-        check_taps("PoissonFilter", "taps", self.taps)
+        check_field(self, "radius", "of at least 0", lambda radius: radius >= 0)
+        check_field(self, "taps", "from 1 to 128", lambda taps: 1 <= taps <= 128, whole=True)
 
     def reach(self) -> Scalar:
         """Return the radius and one texel."""

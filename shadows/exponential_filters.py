@@ -6,11 +6,14 @@ about the middle of the depth range, where float32 holds them up to 88.7 from en
 and receivers are compared in the logarithm or as ratios, so that nothing overflows.
 """
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from ._checks import check_field
 from .moment_filter import MomentFilter, Moments
 from .transforms import Scalar
 from .variance_filter import chebyshev_bound
@@ -20,7 +23,7 @@ _EVSM_LIMIT = 42.0  # of half the logarithm, 44.36; the rest is left to derivati
 
 
 class ESMFilter(MomentFilter):
-    """The mean of ``exp(exponent * (stored - depth))``, at most 1.
+    """The mean of ``exp(exponent * (stored - depth))``, at most 1; needs no bias.
 
     For depths in [0, 1]. Receivers behind every texel of the window are right; one in
     front of some is too bright, most where a caster touches what it shades.
@@ -36,11 +39,12 @@ class ESMFilter(MomentFilter):
         Maps", Graphics Interface 2008.
     """
 
+    needs_bias: ClassVar[bool] = False
     exponent: Scalar = eqx.field(default=80.0, metadata={"unit": "per depth range"})
 
     def __check_init__(self) -> None:
         """Refuse an exponent that float32 cannot hold."""
-        self._check_range("exponent", least=0.0, most=_ESM_LIMIT)
+        _check_exponent(self, "exponent", _ESM_LIMIT)
 
     def moments(self, depth: Float[Array, "..."]) -> Moments:
         """Return the exponential of the depth."""
@@ -53,7 +57,7 @@ class ESMFilter(MomentFilter):
 
 
 class EVSM2Filter(MomentFilter):
-    """Chebyshev's bound of the exponential of the depth.
+    """Chebyshev's bound of the exponential of the depth; needs no bias.
 
     Far less light bleeds through several blockers than with the depth itself; near contacts
     it leaks.
@@ -70,13 +74,14 @@ class EVSM2Filter(MomentFilter):
         A. Lauritzen, M. McCool, "Layered Variance Shadow Maps", Graphics Interface 2008.
     """
 
+    needs_bias: ClassVar[bool] = False
     exponent: Scalar = eqx.field(default=40.0, metadata={"unit": "per half depth range"})
     min_variance: Scalar = eqx.field(default=1e-8, metadata={"unit": "squared depth range"})
 
     def __check_init__(self) -> None:
         """Refuse an exponent whose squares float32 cannot hold, and a negative variance."""
-        self._check_range("exponent", least=0.0, most=_EVSM_LIMIT)
-        self._check_range("min_variance", least=0.0, most=1.0)
+        _check_exponent(self, "exponent", _EVSM_LIMIT)
+        check_field(self, "min_variance", "from 0 to 1", lambda x: 0 <= x <= 1)
 
     def moments(self, depth: Float[Array, "..."]) -> Moments:
         """Return the exponential and its square."""
@@ -115,11 +120,12 @@ class EVSM4Filter(EVSM2Filter):
         negative_exponent: Of the falling exponential.
     """
 
+    needs_bias: ClassVar[bool] = True  # the second bound is the tighter one on slopes
     negative_exponent: Scalar = eqx.field(default=5.0, metadata={"unit": "per half depth range"})
 
     def __check_init__(self) -> None:
         """Refuse an exponent whose squares float32 cannot hold."""
-        self._check_range("negative_exponent", least=0.0, most=_EVSM_LIMIT)
+        _check_exponent(self, "negative_exponent", _EVSM_LIMIT)
 
     def moments(self, depth: Float[Array, "..."]) -> Moments:
         """Return both exponentials and their squares."""
@@ -133,3 +139,7 @@ class EVSM4Filter(EVSM2Filter):
         value = jnp.exp(-self.negative_exponent * depth)
         falling = self._bound(mean, second, value, self.negative_exponent, sign=-1)
         return jnp.minimum(rising, falling)
+
+
+def _check_exponent(filter: MomentFilter, field: str, limit: float) -> None:
+    check_field(filter, field, f"from 0 to {limit:g}", lambda exponent: 0 <= exponent <= limit)

@@ -35,11 +35,13 @@ class Filter(eqx.Module):
             the receiver's plane mean something to it.
         wide: Whether it reads farther than 2x2 texels, where one depth serves all badly.
         reads_anew: Whether what it reads depends on the receiver's depth.
+        needs_bias: Whether surfaces shade themselves under it without a bias.
     """
 
     compares: ClassVar[bool] = True
     wide: ClassVar[bool] = True
     reads_anew: ClassVar[bool] = False
+    needs_bias: ClassVar[bool] = True
 
     @abc.abstractmethod
     def reach(self) -> Scalar:

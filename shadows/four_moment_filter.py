@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from ._checks import check_field
 from .moment_filter import MomentFilter, Moments
 from .transforms import Scalar
 
@@ -40,7 +41,7 @@ class MSMFilter(MomentFilter):
 
     def __check_init__(self) -> None:
         """Refuse a share that is not in [0, 1]."""
-        self._check_range("moment_bias", least=0.0, most=1.0)
+        check_field(self, "moment_bias", "from 0 to 1", lambda x: 0 <= x <= 1)
 
     def moments(self, depth: Float[Array, "..."]) -> Moments:
         """Return four powers of the depth."""

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ._checks import check_field
 from .lights import DirectionalLight, Light, PointLight, Points
 from .transforms import (
     Camera,
@@ -128,10 +129,7 @@ class CascadesLayout(Layout):
 
     def __check_init__(self) -> None:
         """Refuse a count that is not from 1 to 8."""
-        if isinstance(self.count, bool) or not isinstance(self.count, int):
-            raise ValueError(f"CascadesLayout: expected a whole `count`, got {self.count!r}")
-        if not 1 <= self.count <= 8:
-            raise ValueError(f"CascadesLayout: expected `count` from 1 to 8, got {self.count}")
+        check_field(self, "count", "from 1 to 8", lambda count: 1 <= count <= 8, whole=True)
 
     def matrices(
         self,

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ._checks import check_field
 from .transforms import Scalar, Vector
 
 
@@ -32,12 +33,8 @@ class Medium(eqx.Module):
 
     def __check_init__(self) -> None:
         """Refuse a negative density, and an anisotropy that no scattering has."""
-        known = lambda value: isinstance(value, int | float | np.ndarray | np.number)
-        if known(self.density) and not 0 <= float(self.density) < np.inf:
-            raise ValueError(f"Medium: expected `density` of at least 0, got {self.density}")
-        if known(self.anisotropy) and not -1 < float(self.anisotropy) < 1:
-            got = self.anisotropy
-            raise ValueError(f"Medium: expected `anisotropy` between -1 and 1, got {got}")
+        check_field(self, "density", "of at least 0", lambda x: 0 <= x < np.inf)
+        check_field(self, "anisotropy", "between -1 and 1", lambda x: -1 < x < 1)
 
     def scattered(self, cos_angle: Float[Array, "*points"]) -> Float[Array, "*points"]:
         """Return pi times the phase function of Henyey and Greenstein.

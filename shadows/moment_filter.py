@@ -22,6 +22,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from ._checks import check_field
 from .compare import Compare
 from .filters import Filter
 from .shadow_map import Receiver, ShadowMap
@@ -67,15 +68,14 @@ class MomentFilter(Filter):
     def __check_init__(self) -> None:
         """Refuse what is no whole number, and a level that there is not."""
         for option, unit in (("radius", "texels"), ("mips", "levels")):
-            value = getattr(self, option)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-                expected = f"expected `{option}` to be a whole number of {unit} of at least 0"
-                raise ValueError(f"{type(self).__name__}: {expected}, got {value}")
+            expected = f"to be a whole number of {unit} of at least 0"
+            check_field(self, option, expected, lambda number: number >= 0, whole=True)
         if self.blur not in ("box", "gaussian"):
             raise ValueError(
                 f"{type(self).__name__}: expected `blur` box or gaussian, got {self.blur!r}"
             )
-        self._check_range("level", least=0.0, most=float(self.mips), limit=f"{self.mips} (`mips`)")
+        expected = f"from 0 to {self.mips} (`mips`)"
+        check_field(self, "level", expected, lambda level: 0 <= level <= self.mips)
 
     @abc.abstractmethod
     def moments(self, depth: Float[Array, "..."]) -> Moments:
@@ -167,18 +167,6 @@ class MomentFilter(Filter):
                 f"{name}: expected a map whose sides can be halved {self.mips} times (`mips`), "
                 f"got {size}"
             )
-
-    def _check_range(
-        self, option: str, *, least: float, most: float, limit: str = "", below: bool = False
-    ) -> None:
-        """Refuse a number out of range; numbers inside a traced program pass."""
-        value = getattr(self, option)
-        if not isinstance(value, int | float | np.number | np.ndarray):
-            return
-        number = float(value)
-        if not (least <= number <= most) or (below and number == most):
-            expected = f"from {least:g} to {'below ' if below else ''}{limit or f'{most:g}'}"
-            raise ValueError(f"{type(self).__name__}: expected `{option}` {expected}, got {value}")
 
 
 def depth_ratio(texel_from_world: Float[Array, "*maps 4 4"]) -> Float[Array, "*maps"]:

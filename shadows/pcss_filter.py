@@ -6,6 +6,7 @@ What counts as a blocker is soft, so that the width changes smoothly with the li
 and with everything that moves.
 """
 
+import dataclasses
 from typing import ClassVar
 
 import equinox as eqx
@@ -13,11 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ._checks import check_field
+from .area_lights import AreaLight
 from .compare import Compare, SoftCompare
-from .disc_filters import check_least, check_taps, poisson_disc, read_disc
+from .disc_filters import poisson_disc, read_disc
 from .filters import Filter, compare_taps
+from .lights import Light
 from .shadow_map import Receiver, ShadowMap
 from .transforms import Scalar
+
+_SIZE = 0.1  # of lights that have none
 
 
 class PCSSFilter(Filter):
@@ -28,7 +34,8 @@ class PCSSFilter(Filter):
 
     Attributes:
         light_size: Diameter of the light, world length; of parallel light, the tangent of
-            the full angle that it fills.
+            the full angle that it fills. None for an area light's own, and 0.1 for lights
+            that have none.
         blocker_softness: Width of the step from what blocks to what does not.
         search_taps: Points at which blockers are looked for.
         taps: Points of the filter.
@@ -42,7 +49,7 @@ class PCSSFilter(Filter):
     """
 
     reads_anew: ClassVar[bool] = True
-    light_size: Scalar = eqx.field(default=0.1, metadata={"unit": "world length"})
+    light_size: Scalar | None = eqx.field(default=None, metadata={"unit": "world length"})
     blocker_softness: Scalar = eqx.field(default=0.5, metadata={"unit": "half texels"})
     search_taps: int = eqx.field(static=True, default=16, metadata={"whole": "points"})
     taps: int = eqx.field(static=True, default=16, metadata={"whole": "points"})
@@ -50,11 +57,10 @@ class PCSSFilter(Filter):
 
     def __check_init__(self) -> None:
         """Refuse negative sizes, and numbers of taps out of range."""
-        check_least("PCSSFilter", "light_size", self.light_size, 0.0)
-        check_least("PCSSFilter", "blocker_softness", self.blocker_softness, 0.0)
-        check_least("PCSSFilter", "widest", self.widest, 1.0)
-        check_taps("PCSSFilter", "search_taps", self.search_taps)
-        check_taps("PCSSFilter", "taps", self.taps)
+        for field, least in (("light_size", 0), ("blocker_softness", 0), ("widest", 1)):
+            check_field(self, field, f"of at least {least}", lambda x, least=least: x >= least)
+        for field in ("search_taps", "taps"):
+            check_field(self, field, "from 1 to 128", lambda taps: 1 <= taps <= 128, whole=True)
 
     def reach(self) -> Scalar:
         """Return the widest radius and one texel."""
@@ -93,8 +99,17 @@ class PCSSFilter(Filter):
         """Return half the penumbra's width, in texels, of a blocker so far from the receiver."""
         left = jnp.maximum(1 - gap * receiver.nearness, 1e-3)
         widening = jnp.where(receiver.nearness > 0, receiver.nearness / left, 1.0)
-        width = gap * widening * self.light_size
+        size = _SIZE if self.light_size is None else self.light_size
+        width = gap * widening * size
         return jnp.clip(0.5 * width / receiver.texel_length, 0.0, self.widest)
+
+
+def sized_for(filter: Filter, light: Light) -> Filter:
+    """Return a filter with the light's size where that was left open; others as they are."""
+    if not isinstance(filter, PCSSFilter) or filter.light_size is not None:
+        return filter
+    size = light.diameter if isinstance(light, AreaLight) else _SIZE
+    return dataclasses.replace(filter, light_size=size)
 
 
 def _seeking(count: int) -> Float[np.ndarray, "points 2"]:

@@ -12,11 +12,9 @@ from typing import ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 
-from .bias import Bias, Unit, in_world, unit_field
+from .bias import Bias, Unit, in_world, length_field, unit_field
 from .shadow_map import PlaneSlope, Receiver
 from .transforms import Scalar
-
-_LENGTHS = {"world": "world length", "texel": "texel widths", "reach": "reaches of the filter"}
 
 
 class ReceiverPlaneBias(Bias):
@@ -49,7 +47,7 @@ class AdaptiveBias(Bias):
     the depth buffer.
 
     Attributes:
-        tolerance: What is left to rounding and curvature.
+        tolerance: What is left to curvature: the inside of a bowl lies before its planes.
         unit: Of ``tolerance``.
 
     References:
@@ -58,8 +56,8 @@ class AdaptiveBias(Bias):
     """
 
     follows_plane: ClassVar[bool] = True
-    tolerance: Scalar = eqx.field(default=0.0, metadata={"unit": _LENGTHS})
-    unit: Unit = unit_field("world")
+    tolerance: Scalar = length_field(0.3)
+    unit: Unit = unit_field("texel")
 
     def __call__(self, receiver: Receiver, reach: Scalar = 0.5) -> Receiver:
         """Return the receiver with its plane followed where it comes nearer."""

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from tangentspace._math import dot, safe_normalize
 from tangentspace.texture import clamp, sample_bilinear
 
+from ._checks import check_field
 from .lights import Light, Points
 from .transforms import Scalar, Vector, look_at, perspective
 
@@ -57,9 +58,7 @@ class Projector(Light):
             raise ValueError(
                 f"Projector: expected `image` of shape (height, width, 3 or 1), got {shape}"
             )
-        angle = self.vertical_fov
-        if isinstance(angle, float | np.ndarray | np.number) and not 0 < float(angle) < np.pi:
-            raise ValueError(f"Projector: expected `vertical_fov` between 0 and pi, got {angle}")
+        check_field(self, "vertical_fov", "between 0 and pi", lambda angle: 0 < angle < np.pi)
 
     def to_light(self, positions: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
         """Return unit vectors towards the projector's position."""

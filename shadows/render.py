@@ -96,8 +96,10 @@ def default_bias(filter: Filter) -> Bias:
 
     In closed form for lookups of up to 2x2 texels and for those that compare no texels;
     following the receiver's plane for wider ones, where one depth for all texels would take
-    away much shadow.
+    away much shadow; none for filters that need none.
     """
+    if not filter.needs_bias:
+        return CombinedBias()
     return AdaptiveBias() if filter.compares and filter.wide else AnalyticBias()
 
 

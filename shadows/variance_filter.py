@@ -1,15 +1,18 @@
 """Variance shadow maps: mean and variance of the depth bound the share that blocks."""
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ._checks import check_field
 from .moment_filter import MomentFilter, Moments
 from .transforms import Scalar
 
 
 class VSMFilter(MomentFilter):
-    """Chebyshev's bound on the lit share, from the mean and variance of the depth.
+    """Chebyshev's bound on the lit share, from the mean and variance of the depth; needs no bias.
 
     Exact for one plane that blocks and one that receives; where blockers lie at several
     depths light bleeds through them.
@@ -29,13 +32,14 @@ class VSMFilter(MomentFilter):
         "Summed-Area Variance Shadow Maps", GPU Gems 3, 2007, section 8.4.3 (bleeding).
     """
 
+    needs_bias: ClassVar[bool] = False
     min_variance: Scalar = eqx.field(default=1e-6, metadata={"unit": "squared depth range"})
     bleeding: Scalar = eqx.field(default=0.0, metadata={"unit": "share"})
 
     def __check_init__(self) -> None:
         """Refuse a negative variance, and a share that is not in [0, 1)."""
-        self._check_range("min_variance", least=0.0, most=1.0)
-        self._check_range("bleeding", least=0.0, most=1.0, below=True)
+        check_field(self, "min_variance", "from 0 to 1", lambda x: 0 <= x <= 1)
+        check_field(self, "bleeding", "from 0 to below 1", lambda x: 0 <= x < 1)
 
     def moments(self, depth: Float[Array, "..."]) -> Moments:
         """Return the depth and its square."""

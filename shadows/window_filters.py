@@ -12,6 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ._checks import check_field
 from .filters import Tap, TapFilter, fetch
 from .shadow_map import Receiver, ShadowMap
 from .transforms import Scalar
@@ -69,14 +70,6 @@ class BilinearFilter(WindowFilter):
         return [1 - fraction, fraction]
 
 
-def _check_radius(name: str, radius: int, most: int) -> None:
-    if isinstance(radius, bool) or not isinstance(radius, int) or not 0 <= radius <= most:
-        raise ValueError(
-            f"{name}: expected `radius` to be a whole number of texels from 0 to {most}, "
-            f"got {radius}"
-        )
-
-
 class PCFFilter(WindowFilter):
     """The mean of 2x2 bilinear lookups at the (2 radius + 1)^2 texels round the receiver.
 
@@ -92,7 +85,8 @@ class PCFFilter(WindowFilter):
 
     def __check_init__(self) -> None:
         """Refuse a radius that is no whole number from 0 to 16."""
-        _check_radius("PCFFilter", self.radius, 16)
+        expected = "to be a whole number of texels from 0 to 16"
+        check_field(self, "radius", expected, lambda radius: 0 <= radius <= 16, whole=True)
 
     def reach(self) -> Scalar:
         """Return the radius and one texel."""
@@ -119,8 +113,7 @@ class TentFilter(WindowFilter):
 
     def __check_init__(self) -> None:
         """Refuse a radius that is not 1, 2 or 3."""
-        if self.radius not in (1, 2, 3):
-            raise ValueError(f"TentFilter: expected `radius` 1, 2 or 3, got {self.radius}")
+        check_field(self, "radius", "1, 2 or 3", lambda radius: 1 <= radius <= 3, whole=True)
 
     def reach(self) -> Scalar:
         """Return the radius and one texel."""

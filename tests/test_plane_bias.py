@@ -16,17 +16,23 @@ from shadows import (
     BilinearFilter,
     CombinedBias,
     ConstantBias,
+    ESMFilter,
+    EVSM2Filter,
+    EVSM4Filter,
     Filter,
     HardCompare,
     MidpointBias,
+    MSMFilter,
     NearestFilter,
     NormalOffsetBias,
     PCFFilter,
     PCSSFilter,
     PoissonFilter,
     ReceiverPlaneBias,
+    ShadowMap,
     SlopeBias,
     TentFilter,
+    VSMFilter,
     check_techniques,
     default_bias,
     look_at,
@@ -54,6 +60,7 @@ FILTERS = {
     "pcss": PCSSFilter(0.05, widest=8),
 }
 SHARP = [name for name in FILTERS if name not in ("poisson", "pcss")]
+FOLLOWING = ReceiverPlaneBias(), AdaptiveBias(0.0)
 FIRST, COUNT = SIZE // 2, 4  # the texels looked at
 
 move = jax.jit(lambda receiver, bias, filter: bias(receiver, filter.reach()))
@@ -149,7 +156,7 @@ def test_half_of_an_unbiased_plane_is_in_acne(name):
 
 @pytest.mark.parametrize("light", ["parallel", "lamp"])
 @pytest.mark.parametrize("degrees", [0.0, 45.0, 75.0, 88.0])
-@pytest.mark.parametrize("bias", [ReceiverPlaneBias(), AdaptiveBias()], ids=["plane", "adaptive"])
+@pytest.mark.parametrize("bias", FOLLOWING, ids=["plane", "adaptive"])
 def test_following_the_plane_needs_nothing_else(bias, degrees, light, dtype):
     """At every turn of the map, under every filter, in both precisions."""
     for turn in (0.0, np.pi / 4, 2.0):
@@ -160,7 +167,7 @@ def test_following_the_plane_needs_nothing_else(bias, degrees, light, dtype):
 
 
 @pytest.mark.parametrize("light", ["parallel", "lamp"])
-@pytest.mark.parametrize("bias", [ReceiverPlaneBias(), AdaptiveBias()], ids=["plane", "adaptive"])
+@pytest.mark.parametrize("bias", FOLLOWING, ids=["plane", "adaptive"])
 def test_following_the_plane_far_from_the_origin(bias, light):
     """In single precision: the place in the map is rounded, and on a slope that is depth."""
     for degrees in (0.0, 75.0, 88.0):
@@ -200,14 +207,33 @@ def test_in_a_valley_planes_mislead_within_the_reach_alone(name):
     filter = FILTERS[name]
     inside = away < filter.reach()
     assert 10 < inside.sum() < 400
-    plane, adaptive = (
-        np.asarray(visibility(scene, bias, filter))
-        for bias in (ReceiverPlaneBias(), AdaptiveBias())
-    )
+    plane, adaptive = (np.asarray(visibility(scene, bias, filter)) for bias in FOLLOWING)
     assert_close(np.stack([plane, adaptive])[:, ~inside], np.ones((2, (~inside).sum())), ulps=8)
     assert plane[inside].min() < 0.7
     assert np.all(adaptive >= plane - 1e-12)
     assert adaptive.mean() > plane.mean() + 0.001
+
+
+@pytest.mark.parametrize("radius", [1, 2, 4])
+def test_the_tolerance_clears_a_bowl(radius):
+    """Texels at r lie r^2 / 2R before the plane of a bowl of radius R: up to 0.3 texels here."""
+    filter, size = PCFFilter(radius), 32
+    bowl = 2 * float(filter.reach()) ** 2 / 0.6  # texels
+    texel = 2 / size  # the map's clip space is the world
+    depth = lambda across, down: 0.8 - texel / 2 * (across**2 + down**2) / (2 * bowl)
+    down, across = np.mgrid[:size, :size] + 0.5 - size / 2
+    shadow_map = ShadowMap(jnp.asarray(depth(across, down)), jnp.eye(4))
+    across, down = np.random.default_rng(3).uniform(-2, 2, (2, 200))
+    position = np.stack([across * texel, -down * texel, 2 * depth(across, down) - 1], axis=-1)
+    normal = np.stack([-across / bowl, down / bowl, np.full(200, -1.0)], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    to_light = jnp.broadcast_to(np.float64([0, 0, -1]), normal.shape)
+    receiver = receive(
+        jnp.asarray(position), jnp.asarray(normal), to_light, shadow_map.texel_from_world
+    )
+    lit = {t: look(shadow_map, move(receiver, AdaptiveBias(t), filter), filter) for t in (0.0, 0.3)}
+    assert float(lit[0.0].max()) < 0.7
+    assert_close(lit[0.3], np.ones(200), ulps=8)
 
 
 # Laws
@@ -323,11 +349,15 @@ class BlurFilter(Filter):
         return jnp.ones_like(receiver.depth)
 
 
-def test_default_bias_follows_the_plane_for_wide_filters():
+def test_default_bias_is_what_a_filter_needs():
     for filter in (NearestFilter(), BilinearFilter(), BlurFilter()):
         assert default_bias(filter) == AnalyticBias()
     for filter in (PCFFilter(0), PCFFilter(2), TentFilter(), PoissonFilter(), PCSSFilter()):
         assert default_bias(filter) == AdaptiveBias()
+    for filter in (VSMFilter(), ESMFilter(), EVSM2Filter()):
+        assert default_bias(filter) == CombinedBias()
+    for filter in (EVSM4Filter(), MSMFilter()):
+        assert default_bias(filter) == AnalyticBias()
 
 
 @pytest.mark.parametrize("name", ["nearest", "bilinear", "pcf 4", "tent 3", "poisson", "pcss"])

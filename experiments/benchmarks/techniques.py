@@ -7,7 +7,9 @@ alone is timed apart. Run it on an idle machine.
 """
 
 import json
+import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,17 +20,24 @@ import numpy as np
 import tyro
 from jaxtyping import Array
 
+from shadows.appearance import Appearance
 from shadows.bias import AnalyticBias, Bias, CombinedBias, ConstantBias
 from shadows.compare import SoftCompare
 from shadows.filters import Filter
 from shadows.layouts import Layout, SingleLayout
+from shadows.light_map import LightMap, look_up_light, shade_with_light_map
 from shadows.lights import Light, PointLight
-from shadows.render import default_bias, receive_surface, shade
+from shadows.medium import Medium
+from shadows.render import Rendering, default_bias, receive_surface, shade
 from shadows.shadow_map import ShadowMap, render_shadow_map
+from shadows.shafts import add_shafts
+from shadows.silhouettes import mesh_edges
 from shadows.surface import Surface, render_surface
+from shadows.volumes import volume_visibility
 from shadows.window_filters import BilinearFilter, PCFFilter, TentFilter
 from tangentspace._math import dot
 
+from ..baking.bake_light import bake_light_map
 from ..checks import check_out
 from ..console import say_table, stage
 from ..files.images import atomic_path
@@ -60,11 +69,12 @@ def bench_techniques(
         "filters": _rows(scene, "bilinear", with_bias, runs),
         "biases": _rows(scene, "no bias", with_filter, runs),
         "layouts": _layouts(scene, runs),
+        "other ways": _others(scene, runs),
     }
     made_with = {"versions": versions(), "device": device(), "commit": commit()}
     with atomic_path(out) as temporary:
         temporary.write_text(json.dumps(rows | made_with, indent=1) + "\n", "utf-8")
-    for kind in ("filters", "biases", "layouts"):
+    for kind in ("filters", "biases", "layouts", "other ways"):
         _print(kind, rows[kind])
 
 
@@ -192,6 +202,58 @@ def _layouts(scene: Scene, runs: int) -> list[dict[str, Any]]:
                     **measure(functions, runs=runs),
                 }
             )
+    return rows
+
+
+def _others(scene: Scene, runs: int) -> list[dict[str, Any]]:
+    """Time an image whose shadows need no map or more than one lookup, the eye's pass kept."""
+    light, bias = scene.lights[0], AnalyticBias()
+    surface, shadow_map = _kept(scene, light, SingleLayout(), BilinearFilter(), bias)
+    with stage("baking a light map"):
+        start = time.perf_counter()
+        bake = bake_light_map(scene, size=_IMAGE[0])
+        seconds = time.perf_counter() - start
+    mesh, camera, light = jax.tree.map(jnp.asarray, (scene.mesh, scene.camera, light))
+    unwrapped, light_map = jax.tree.map(jnp.asarray, (bake.scene.mesh, bake.light_map))
+    unwrapped_surface = jax.jit(partial(render_surface, image_size=_IMAGE))(unwrapped, camera)
+    edges = mesh_edges(scene.mesh.positions, scene.mesh.faces)
+    prepare, image, _ = _functions(light, BilinearFilter(), bias)
+
+    def each_frame(surface: Surface, mesh: Any) -> Array:
+        matrix = light.clip_from_world(mesh.positions)
+        drawn = render_shadow_map(mesh.positions, mesh.faces, matrix, map_size=_MAP)
+        return image(surface, prepare(drawn))
+
+    def by_light_map(surface: Surface, mesh: Any, light_map: LightMap) -> Array:
+        return shade_with_light_map(surface, look_up_light(mesh, surface, light_map))
+
+    def by_volumes(surface: Surface, mesh: Any) -> Array:
+        visibility = volume_visibility(mesh, camera, surface, light, edges=edges)
+        return shade(surface, (light,), (visibility,))
+
+    def with_shafts(surface: Surface, shadow_map: ShadowMap) -> Array:
+        color = image(surface, prepare(shadow_map))
+        drawn = Rendering(color, (), surface, Appearance(surface.normal), (shadow_map,))
+        return add_shafts(drawn, camera, light, Medium(0.2), background_distance=6.0).color
+
+    measured = measure(
+        {
+            "shadow map, drawn each frame": (each_frame, (surface, mesh)),
+            "light map": (by_light_map, (unwrapped_surface, unwrapped, light_map)),
+            "shadow volumes": (by_volumes, (surface, mesh)),
+            "map kept, shafts of 32 steps": (with_shafts, (surface, shadow_map)),
+        },
+        runs=runs,
+    )
+    kept = {
+        "light map": np.asarray(light_map.texels).nbytes,
+        "map kept, shafts of 32 steps": shadow_map.depth.nbytes,
+    }
+    rows = [
+        {"technique": name, "kept_bytes": int(kept.get(name, 0)), "image": row}
+        for name, row in measured.items()
+    ]
+    rows[1]["bake_s"] = seconds
     return rows
 
 

@@ -69,7 +69,7 @@ def render(
     layout: LayoutWords = (),
     bias: BiasWords = None,
     compare: CompareWords = (),
-    filter: FilterWords = ("bilinear",),
+    filter: FilterWords = (),
     shading: ShadingWords = ("blinn-phong",),
     shadows: Annotated[
         Literal["maps", "volumes"],
@@ -146,7 +146,7 @@ def render(
     if not 0 <= mist < np.inf:
         raise ValueError(f"--mist: expected a density of at least 0, got {mist}")
     asked = {
-        "bias": bias is not None, "compare": compare, "filter": filter != ("bilinear",),
+        "bias": bias is not None, "compare": compare, "filter": filter,
         "layout": layout, "shadow-map-out": shadow_map_out, "mist": mist,
     }  # fmt: skip
     if shadows == "volumes":
