@@ -13,6 +13,8 @@ from jaxtyping import Array, Float
 from .shadow_map import Receiver
 from .transforms import Scalar
 
+_LIT = 100.0  # the sigmoid of this is 1, in double precision too
+
 
 class Compare(eqx.Module):
     """Turns stored depths into visibility."""
@@ -64,9 +66,9 @@ class SoftCompare(Compare):
         squared = receiver.footprint**2 + across**2
         flat = squared <= 0
         width = self.softness * jnp.sqrt(jnp.where(flat, 1, squared))
-        hard = flat | (width <= 0) | (stored >= 1)
-        soft = jax.nn.sigmoid(margin / jnp.where(hard, 1, width))
-        return jnp.where(hard, (margin >= 0).astype(stored.dtype), soft)
+        hard = flat | (width <= 0)
+        scaled = jnp.where(stored >= 1, _LIT, margin / jnp.where(hard, 1, width))
+        return jnp.where(hard, (margin >= 0).astype(stored.dtype), jax.nn.sigmoid(scaled))
 
 
 def _margin(stored: Float[Array, "*points"], receiver: Receiver) -> Float[Array, "*points"]:
