@@ -7,11 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from shadows.area_lights import AreaLight, DiscLight, RectangleLight
 from shadows.filters import Filter
 from shadows.layouts import CubeLayout, Layout, SingleLayout
 from shadows.lights import DirectionalLight, Light, PointLight, SpotLight
+from shadows.projector import Projector
 from shadows.shadow_map import Casters, ShadowMap
-from shadows.transforms import transform_points
+from shadows.transforms import Scalar, transform_points
 
 from .scene import Scene
 
@@ -118,12 +120,31 @@ def check_shadow_map(scene: Scene, shadow_map: ShadowMap, *, casters: Casters) -
 
 
 def _check_light(name: str, light: Light) -> None:
-    if isinstance(light, DirectionalLight | SpotLight):
+    """Refuse a light whose own numbers have no sense."""
+    if isinstance(light, DirectionalLight | SpotLight | Projector | AreaLight):
         length = float(np.linalg.norm(np.asarray(light.direction)))
         if not np.isfinite(length) or length < 1e-6:
-            raise ValueError(f"{name}: the light's direction is zero (light at its target?)")
-    if isinstance(light, SpotLight) and not 0 < float(light.outer_angle) < np.pi / 2:
-        raise ValueError(
-            f"{name}: expected the spot's outer angle between 0 and pi/2, "
-            f"got {float(light.outer_angle):g}"
-        )
+            raise ValueError(
+                f"{name}: the light's direction is zero or not finite (light at its target?)"
+            )
+    if isinstance(light, Projector | RectangleLight) and not np.isfinite(light.up).all():
+        raise ValueError(f"{name}: the light's `up` is NaN or infinite")
+    if isinstance(light, SpotLight):
+        _check_between(name, "the spot's outer angle", light.outer_angle, np.pi / 2, "pi/2")
+    if isinstance(light, Projector):
+        _check_between(name, "the projector's vertical field", light.vertical_fov, np.pi, "pi")
+        if not np.isfinite(light.image).all():
+            raise ValueError(f"{name}: the projector's image has pixels that are NaN or infinite")
+    if isinstance(light, DiscLight):
+        _check_between(name, "the disc light's radius", light.radius)
+    if isinstance(light, RectangleLight):
+        _check_between(name, "the rectangle light's width", light.width)
+        _check_between(name, "the rectangle light's height", light.height)
+
+
+def _check_between(
+    name: str, what: str, value: Scalar, most: float = np.inf, in_words: str = "infinity"
+) -> None:
+    """Refuse a number that is not above 0 and below the most."""
+    if not 0 < float(value) < most:
+        raise ValueError(f"{name}: expected {what} between 0 and {in_words}, got {float(value):g}")

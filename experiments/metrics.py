@@ -2,8 +2,9 @@
 
 Acne is a dark pixel where the truth is lit, a leak a lit one where the truth is dark. A
 pixel is right only if its visibility is on the truth's side of 0.5: exactly 0.5 decides
-nothing and counts as wrong in both, and so does NaN (as 1 in the soft errors). Pixels
-without a surface do not count.
+nothing and counts as wrong in both, and so does NaN (as 1 in the soft errors). Under an area
+light truth is a share, and acne and leak are how much too dark and too light the pixels are.
+Pixels without a surface do not count.
 """
 
 from typing import NamedTuple
@@ -51,6 +52,29 @@ class ShadowErrors(NamedTuple):
     edge: int
 
 
+class SoftShadowErrors(NamedTuple):
+    """Distances from the share of an area light that is seen, 0 where no pixel has any.
+
+    Acne and leak add up to the mean distance. They are means over all pixels with a surface,
+    not over lit or dark ones alone: in a penumbra a pixel is both.
+
+    Attributes:
+        acne: Mean of ``truth - visibility``, at least 0 each: light that is missing.
+        leak: Mean of ``visibility - truth``, at least 0 each: light that is too much.
+        rmse: Root mean square of the difference.
+        rmse_penumbra: The same over the penumbra alone.
+        surface: Number of pixels with a surface, over which the means are.
+        penumbra: Number of those that see some of the light but not all.
+    """
+
+    acne: float
+    leak: float
+    rmse: float
+    rmse_penumbra: float
+    surface: int
+    penumbra: int
+
+
 def shadow_errors(visibility: Image, truth: Mask, surface: Mask) -> ShadowErrors:
     """Compare visibilities with the truth.
 
@@ -81,6 +105,33 @@ def shadow_errors(visibility: Image, truth: Mask, surface: Mask) -> ShadowErrors
         lit=int(lit.sum()),
         dark=int(dark.sum()),
         edge=int((surface & ~interior).sum()),
+    )
+
+
+def soft_shadow_errors(visibility: Image, truth: Image, surface: Mask) -> SoftShadowErrors:
+    """Compare visibilities with the true shares of an area light.
+
+    Args:
+        visibility: The method's, in [0, 1], 1 = lit; any value where there is no surface.
+        truth: Share of the light that is seen, in [0, 1].
+        surface: True where there is a surface.
+
+    Returns:
+        The errors.
+
+    Raises:
+        ValueError: If the sizes differ.
+    """
+    visibility, truth, surface = _checked("soft_shadow_errors", visibility, truth, surface)
+    penumbra = surface & (truth > 0) & (truth < 1)
+    squared = (visibility - truth) ** 2
+    return SoftShadowErrors(
+        acne=_mean(np.maximum(truth - visibility, 0.0), surface),
+        leak=_mean(np.maximum(visibility - truth, 0.0), surface),
+        rmse=_mean(squared, surface) ** 0.5,
+        rmse_penumbra=_mean(squared, penumbra) ** 0.5,
+        surface=int(surface.sum()),
+        penumbra=int(penumbra.sum()),
     )
 
 
@@ -164,10 +215,10 @@ def _mean(
 
 
 def _checked(
-    caller: str, visibility: Image, truth: Mask, surface: Mask
+    caller: str, visibility: Image, truth: Image | Mask, surface: Mask
 ) -> tuple[
     Float[np.ndarray, "height width"],
-    Bool[np.ndarray, "height width"],
+    Shaped[np.ndarray, "height width"],
     Bool[np.ndarray, "height width"],
 ]:
     """Return the images as NumPy arrays, or raise if their sizes differ."""

@@ -75,7 +75,8 @@ def _option(field: dataclasses.Field, cls: Any) -> str:
     if "choices" in field.metadata:
         return f"{field.name}, {field.default} of {'/'.join(map(str, field.metadata['choices']))}"
     unit = field.metadata.get("whole") or _unit(field, cls)
-    return f"{field.name}, default {field.default} {unit}"
+    default = field.metadata.get("default", field.default)
+    return f"{field.name}, default {default} {unit}"
 
 
 def parse_techniques(

@@ -15,7 +15,7 @@ holds those of regular windows, ``disc_filters`` those of scattered points, and
 import abc
 import functools
 import operator
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -25,6 +25,7 @@ from jax import lax
 from jaxtyping import Array, Float, PyTree
 
 from .compare import Compare
+from .lights import Light
 from .shadow_map import Receiver, ShadowMap
 from .transforms import Scalar
 
@@ -44,6 +45,11 @@ class Filter(eqx.Module):
     wide: ClassVar[bool] = True
     reads_anew: ClassVar[bool] = False
     needs_bias: ClassVar[bool] = True
+
+    def for_light(self, light: Light) -> "Filter":
+        """Return the filter with what it leaves to the light; most leave nothing."""
+        del light
+        return self
 
     @abc.abstractmethod
     def reach(self) -> Scalar:
@@ -145,28 +151,6 @@ def _compare(
     return jnp.where(receiver.outside, 1.0, visibility)
 
 
-_compared = eqx.filter_custom_jvp(_compare)
-
-
-@_compared.def_jvp
-def _compared_jvp(primals: tuple, tangents: tuple) -> tuple[Array, Array | None]:
-    """Keep one derivative in the bias for the reverse pass, not several arrays for each tap."""
-    depth_bias, *rest = primals
-    bias_tangent, *rest_tangents = tangents
-    if bias_tangent is None:
-        visibility, change = _compare(depth_bias, *rest), None
-    else:
-        visibility, slope = _compare_with_slope(depth_bias, *rest)
-        change = slope * bias_tangent
-    if jax.tree.leaves(rest_tangents):
-        known = jax.tree.map(lambda tangent: tangent is not None, rest_tangents, is_leaf=_is_none)
-        moved, still = eqx.partition(rest, known)
-        of_rest = lambda moved: _compare(depth_bias, *eqx.combine(moved, still))
-        _, more = jax.jvp(of_rest, (moved,), (rest_tangents,))
-        change = more if change is None else change + more
-    return visibility, change
-
-
 def _compare_with_slope(
     depth_bias: Float[Array, "*points"], taps: Sequence[Tap], receiver: Receiver, compare: Compare
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
@@ -189,8 +173,45 @@ def _compare_with_slope(
     return visibility, jnp.where(receiver.outside, 0.0, mean.imag)
 
 
-def _is_none(leaf: object) -> bool:
-    return leaf is None
+def keep_slope(function: Callable, with_slope: Callable | None = None) -> Callable:
+    """Return a function whose reverse pass keeps one derivative in its first argument.
+
+    Without, it keeps several arrays for each tap, or computes them again.
+
+    Args:
+        function: Of a number for each point, of which a point's result depends on its own,
+            and of anything else.
+        with_slope: The same with the derivative in that number beside the result; None for
+            the derivative that JAX makes.
+    """
+    kept = eqx.filter_custom_jvp(function)
+
+    def both(numbers: Array, *rest: Any) -> tuple[Array, Array]:
+        if with_slope is not None:
+            return with_slope(numbers, *rest)
+        return jax.jvp(lambda x: function(x, *rest), (numbers,), (jnp.ones_like(numbers),))
+
+    @kept.def_jvp
+    def rule(primals: tuple, tangents: tuple) -> tuple[Array, Array | None]:
+        (numbers, *rest), (number_tangent, *rest_tangents) = primals, tangents
+        if number_tangent is None:
+            value, change = function(numbers, *rest), None
+        else:
+            value, slope = both(numbers, *rest)
+            change = slope * number_tangent
+        if jax.tree.leaves(rest_tangents):
+            is_none = lambda tangent: tangent is None
+            known = jax.tree.map(lambda t: t is not None, rest_tangents, is_leaf=is_none)
+            moved, still = eqx.partition(rest, known)
+            of_rest = lambda moved: function(numbers, *eqx.combine(moved, still))
+            _, more = jax.jvp(of_rest, (moved,), (rest_tangents,))
+            change = more if change is None else change + more
+        return value, change
+
+    return kept
+
+
+_compared = keep_slope(_compare, _compare_with_slope)
 
 
 def look_up(

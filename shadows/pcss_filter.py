@@ -18,7 +18,7 @@ from ._checks import check_field
 from .area_lights import AreaLight
 from .compare import Compare, SoftCompare
 from .disc_filters import poisson_disc, read_disc
-from .filters import Filter, compare_taps
+from .filters import Filter, compare_taps, keep_slope
 from .lights import Light
 from .shadow_map import Receiver, ShadowMap
 from .transforms import Scalar
@@ -49,7 +49,9 @@ class PCSSFilter(Filter):
     """
 
     reads_anew: ClassVar[bool] = True
-    light_size: Scalar | None = eqx.field(default=None, metadata={"unit": "world length"})
+    light_size: Scalar | None = eqx.field(
+        default=None, metadata={"unit": "world length", "default": "the light's own or 0.1"}
+    )
     blocker_softness: Scalar = eqx.field(default=0.5, metadata={"unit": "half texels"})
     search_taps: int = eqx.field(static=True, default=16, metadata={"whole": "points"})
     taps: int = eqx.field(static=True, default=16, metadata={"whole": "points"})
@@ -61,6 +63,13 @@ class PCSSFilter(Filter):
             check_field(self, field, f"of at least {least}", lambda x, least=least: x >= least)
         for field in ("search_taps", "taps"):
             check_field(self, field, "from 1 to 128", lambda taps: 1 <= taps <= 128, whole=True)
+
+    def for_light(self, light: Light) -> "PCSSFilter":
+        """Return the filter with the light's size, where that was left open."""
+        if self.light_size is not None:
+            return self
+        size = light.diameter if isinstance(light, AreaLight) else _SIZE
+        return dataclasses.replace(self, light_size=size)
 
     def reach(self) -> Scalar:
         """Return the widest radius and one texel."""
@@ -74,6 +83,11 @@ class PCSSFilter(Filter):
         self, reading: ShadowMap, receiver: Receiver, compare: Compare
     ) -> Float[Array, "*points"]:
         """Look for blockers, and filter as wide as they say."""
+        return _after_bias(receiver.depth_bias, self, reading, receiver, compare)
+
+    def _visibility(
+        self, reading: ShadowMap, receiver: Receiver, compare: Compare
+    ) -> Float[Array, "*points"]:
         # The farthest that a blocker may be: at the near end of the map.
         farthest = _ray_length(receiver, receiver.depth)
         search = self._radius(receiver, farthest)
@@ -104,12 +118,15 @@ class PCSSFilter(Filter):
         return jnp.clip(0.5 * width / receiver.texel_length, 0.0, self.widest)
 
 
-def sized_for(filter: Filter, light: Light) -> Filter:
-    """Return a filter with the light's size where that was left open; others as they are."""
-    if not isinstance(filter, PCSSFilter) or filter.light_size is not None:
-        return filter
-    size = light.diameter if isinstance(light, AreaLight) else _SIZE
-    return dataclasses.replace(filter, light_size=size)
+@keep_slope
+def _after_bias(
+    depth_bias: Float[Array, "*points"],
+    filter: PCSSFilter,
+    reading: ShadowMap,
+    receiver: Receiver,
+    compare: Compare,
+) -> Float[Array, "*points"]:
+    return filter._visibility(reading, receiver._replace(depth_bias=depth_bias), compare)
 
 
 def _seeking(count: int) -> Float[np.ndarray, "points 2"]:

@@ -83,6 +83,7 @@ def surface_visibility(
 ) -> Float[Array, "height width"]:
     """Return the light's visibility at each pixel; 0 on faces turned away from the light."""
     check_techniques(bias, filter)
+    filter = filter.for_light(light)
     reach = filter.reach()
     receiver = receive_surface(surface, light, shadow_map, reach=reach)
     facing = dot(receiver.normal, receiver.to_light) > 0

@@ -169,6 +169,7 @@ def scattered_light(
     """
     if steps < 1:
         raise ValueError(f"scattered_light: expected `steps` of at least 1, got {steps}")
+    filter = filter.for_light(light)
     prepared, reach = filter.prepare(shadow_map), filter.reach()
     step = rays.length / steps
 

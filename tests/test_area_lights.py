@@ -13,11 +13,14 @@ from experiments.truth.rays import Occluders, trace_visibility
 from shadows import (
     DiscLight,
     HardCompare,
+    Medium,
     NearestFilter,
+    PCSSFilter,
     PerspectiveCamera,
     PointLight,
     RectangleLight,
     SlopeBias,
+    add_shafts,
     look_at,
     render,
     transform_points,
@@ -86,6 +89,17 @@ def test_points_are_spread_evenly(kind):
     area = np.pi * 0.3**2 if kind == "disc" else 0.24
     distance = np.linalg.norm(points[:, None] - points, axis=-1) + np.eye(1000)
     assert distance.min() > 0.6 * np.sqrt(area / 1000)
+
+
+@pytest.mark.parametrize("kind", LIGHTS)
+def test_the_diameter_is_that_of_a_disc_that_spreads_as_far(kind):
+    """On a disc the mean square of the distance from the centre is an eighth of it squared."""
+    light = LIGHTS[kind]
+    offsets = np.asarray(light.sample_points(4000)) - light.position
+    spread = np.sqrt(8 * (offsets**2).sum(axis=1).mean())
+    assert float(light.diameter) == pytest.approx(spread, rel=1e-4)  # measured 8e-8, 1e-5
+    if kind == "disc":
+        assert light.diameter == 0.6
 
 
 def test_a_light_without_size_is_a_point():
@@ -234,13 +248,15 @@ def test_one_sample_of_a_disc_is_nearly_its_centre():
 # The image
 
 
-def test_an_area_light_renders_as_any_other():
-    """Its shadow map stands at its centre."""
+def placed_box():
     matrix = np.eye(4)
     matrix[:3, 3] = 0.3, 0.6, 0.1
-    mesh = merge(
-        transform_mesh(box((0.3, 0.2, 0.3), dtype=np.float64), matrix), plane(2.0, dtype=np.float64)
-    )
+    return transform_mesh(box((0.3, 0.2, 0.3), dtype=np.float64), matrix)
+
+
+def test_an_area_light_renders_as_any_other():
+    """Its shadow map stands at its centre."""
+    mesh = merge(placed_box(), plane(2.0, dtype=np.float64))
     view = np.asarray(look_at(np.array([1.0, 3.0, 4.0]), np.zeros(3), UP))
     camera = PerspectiveCamera(view, 0.7, 1.0, 20.0)
     light = LIGHTS["disc"]
@@ -267,7 +283,46 @@ def test_an_area_light_renders_as_any_other():
     assert not soft[np.asarray(seen.face_ids) < 0].any()
 
 
+def test_a_filter_takes_the_size_that_was_left_open_from_the_light():
+    disc, point = LIGHTS["disc"], PointLight(TILTED["position"])
+    open_size = PCSSFilter(taps=7)
+    assert open_size.for_light(disc) == PCSSFilter(0.6, taps=7)
+    assert open_size.for_light(point) == PCSSFilter(0.1, taps=7)
+    told = PCSSFilter(0.2)
+    assert told.for_light(disc) is told
+    assert NearestFilter().for_light(disc) == NearestFilter()
+
+
+def test_shadows_are_as_soft_as_the_light_is_large():
+    """Unless the filter is told otherwise; in the image, and in mist."""
+    mesh = merge(placed_box(), plane(2.0, dtype=np.float64))
+    view = np.asarray(look_at(np.array([1.0, 3.0, 4.0]), np.zeros(3), UP))
+    camera = PerspectiveCamera(view, 0.7, 1.0, 20.0)
+    settings = {"image_size": (24, 24), "map_size": 128}
+
+    @functools.partial(quick, static_argnums=1)
+    def of(light, size):
+        filter = PCSSFilter(size)
+        image = render(mesh, camera, light, **settings, filter=filter)
+        return image.visibilities[0], add_shafts(
+            image, camera, light, Medium(0.1), steps=4, filter=filter
+        ).color
+
+    open_size, told, other = (of(LIGHTS["disc"], size) for size in (None, 0.6, 0.1))
+    for found, same, differs in zip(open_size, told, other, strict=True):
+        np.testing.assert_array_equal(found, same)
+        assert np.abs(found - differs).max() > 0.01
+
+
 # Derivatives
+
+
+def test_the_diameter_has_its_derivative_also_without_a_size():
+    of = lambda sides: RectangleLight(**TILTED, width=sides[0], height=sides[1]).diameter
+    slopes = jax.grad(of)(jnp.array([0.6, 0.4]))
+    scale = np.sqrt(2 / 3) / np.hypot(0.6, 0.4)
+    assert_close(slopes, scale * np.array([0.6, 0.4]))
+    assert_close(jax.grad(of)(jnp.zeros(2)), np.zeros(2), ulps=0)
 
 
 @pytest.mark.parametrize("kind", LIGHTS)

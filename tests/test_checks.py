@@ -16,7 +16,9 @@ from experiments.checks import (
 )
 from experiments.scenes import EMBEDDED, load_scene
 from experiments.technique_words import choose_layout
+from shadows.area_lights import DiscLight, RectangleLight
 from shadows.lights import DirectionalLight, PointLight, SpotLight
+from shadows.projector import Projector
 from shadows.shadow_map import ShadowMap, render_shadow_map
 
 SCENE = load_scene("stacked")
@@ -139,6 +141,7 @@ def test_the_camera_has_room_between_near_and_far(near, far, passes):
 
 AT_TARGET = np.zeros(3, np.float32)
 HIGH = f32(0, 5, 0)
+SLIDE = np.ones((2, 3, 3), np.float32)
 
 
 @pytest.mark.parametrize(
@@ -152,6 +155,23 @@ HIGH = f32(0, 5, 0)
         (SpotLight(HIGH, -DOWN), "nothing is in the light's view"),
         (SpotLight(f32(np.nan, 5, 0), DOWN), "nothing is in the light's view"),
         (PointLight(f32(0, 0.5, 0)), "inside the scene"),
+        (Projector(HIGH, AT_TARGET, SLIDE), "direction is zero"),
+        (Projector(HIGH, f32(0, np.inf, 0), SLIDE), "direction"),
+        (Projector(HIGH, DOWN, SLIDE, up=f32(0, np.nan, 1)), "`up` is NaN"),
+        (Projector(HIGH, DOWN, SLIDE * np.float32(np.nan)), "image has pixels that are NaN"),
+        (Projector(HIGH, DOWN, SLIDE, jnp.asarray(4.0)), "vertical field between 0 and pi, got 4"),
+        (Projector(HIGH, -DOWN, SLIDE), "nothing is in the light's view"),
+        (DiscLight(HIGH, AT_TARGET, 0.1), "direction is zero"),
+        (DiscLight(HIGH, f32(np.nan, 0, 0), 0.1), "direction"),
+        (DiscLight(HIGH, DOWN, 0.0), "radius between 0 and infinity, got 0"),
+        (DiscLight(HIGH, DOWN, jnp.asarray(-1.0)), "radius between 0 and infinity, got -1"),
+        (DiscLight(HIGH, DOWN, np.inf), "radius between 0 and infinity, got inf"),
+        (DiscLight(f32(0, np.nan, 0), DOWN, 0.1), "nothing is in the light's view"),
+        (DiscLight(HIGH, -DOWN, 0.1), "nothing is in the light's view"),
+        (RectangleLight(HIGH, AT_TARGET, 0.1, 0.1), "direction is zero"),
+        (RectangleLight(HIGH, DOWN, 0.0, 0.1), "width between 0 and infinity, got 0"),
+        (RectangleLight(HIGH, DOWN, 0.1, jnp.asarray(np.nan)), "height .* got nan"),
+        (RectangleLight(HIGH, DOWN, 0.1, 0.1, up=f32(np.nan, 0, 1)), "`up` is NaN"),
     ],
 )
 def test_lights_without_sense_are_refused(light, says):
@@ -161,7 +181,16 @@ def test_lights_without_sense_are_refused(light, says):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("light", [SpotLight(HIGH, DOWN), PointLight(HIGH)])
+@pytest.mark.parametrize(
+    "light",
+    [
+        SpotLight(HIGH, DOWN),
+        PointLight(HIGH),
+        Projector(HIGH, DOWN, SLIDE),
+        DiscLight(HIGH, DOWN, 0.1),
+        RectangleLight(HIGH, DOWN, 0.1, 0.2),
+    ],
+)
 def test_lights_over_the_scene_pass(light):
     check_scene(SCENE._replace(lights=(light,)))
 

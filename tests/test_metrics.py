@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from experiments.metrics import ShadowErrors, contact_gap, shadow_errors
+from experiments.metrics import ShadowErrors, contact_gap, shadow_errors, soft_shadow_errors
 from experiments.truth.rays import Occluders, nearest_occluder_distance, trace_visibility
 from shadows.lights import DirectionalLight
 
@@ -191,7 +191,60 @@ def test_gap_from_traced_distances():
     assert abs(gap - 0.25 * 0.8) <= 0.5 / 399  # half a pixel, measured 0.3
 
 
+def test_soft_errors_of_a_small_image():
+    visibility = image_of("1 .5 .2 0", ".3 .9 0 .1")
+    truth = image_of("1 .75 0 0", ".1 1 .5 .4")
+    surface = image_of("1 1 1 1", "1 1 0 1") > 0
+    errors = soft_shadow_errors(visibility, truth, surface)
+    assert (errors.surface, errors.penumbra) == (7, 3)
+    squares = np.array([0.25, 0.2, 0.2, 0.1, 0.3]) ** 2
+    assert_close(
+        np.array(errors[:4]),
+        np.array(
+            [
+                (0.25 + 0.1 + 0.3) / 7,
+                (0.2 + 0.2) / 7,
+                np.sqrt(squares.sum() / 7),
+                np.sqrt(squares[[0, 2, 4]].sum() / 3),
+            ]
+        ),
+    )
+
+
+def test_nothing_seen_has_no_soft_errors_and_nan_is_as_wrong_as_can_be():
+    truth = np.full((3, 4), 0.5)
+    assert soft_shadow_errors(truth, truth, truth > 1) == (0,) * 6
+    errors = soft_shadow_errors(np.full((3, 4), np.nan), truth, truth > 0)
+    assert errors == (1, 1, 1, 1, 12, 12)
+
+
 # Laws
+
+
+@given(cases(), st.integers(0, 2**32 - 1))
+def test_soft_errors_of_shares(case, seed):
+    """What acne and leak add up to; the complement; the bounds of the root mean square."""
+    visibility, _, surface = case
+    truth = np.random.default_rng(seed).random(surface.shape).round(1)
+    e = soft_shadow_errors(visibility, truth, surface)
+    distance = np.abs(visibility - truth)[surface]
+    mean = distance.mean() if surface.any() else 0.0
+    assert_close(np.array(e.acne + e.leak), mean)
+    assert mean <= e.rmse * (1 + 1e-12)
+    assert e.rmse <= distance.max(initial=0) * (1 + 1e-12)
+    assert e.penumbra == ((truth > 0) & (truth < 1) & surface).sum()
+    c = soft_shadow_errors(1 - visibility, 1 - truth, surface)
+    assert_close(np.array(c[:4]), np.array([e.leak, e.acne, e.rmse, e.rmse_penumbra]))
+
+
+@given(cases())
+def test_soft_errors_of_a_hard_truth_are_those_of_its_lit_and_dark_pixels(case):
+    visibility, truth, surface = case
+    soft = soft_shadow_errors(visibility, truth.astype(np.float64), surface)
+    hard = shadow_errors(visibility, truth, surface)
+    assert (soft.surface, soft.penumbra, soft.rmse_penumbra) == (hard.lit + hard.dark, 0, 0)
+    assert_close(np.array(soft.acne * soft.surface), hard.soft_acne * hard.lit, ulps=256)
+    assert_close(np.array(soft.leak * soft.surface), hard.soft_leak * hard.dark, ulps=256)
 
 
 @given(cases())
@@ -245,6 +298,8 @@ def test_sizes_must_agree():
     same = np.zeros((3, 4), bool)
     with pytest.raises(ValueError, match=r"shadow_errors: .*'truth': \(4, 3\)"):
         shadow_errors(image, other, same)
+    with pytest.raises(ValueError, match=r"^soft_shadow_errors: .*'truth': \(4, 3\)"):
+        soft_shadow_errors(image, image.T, same)
     with pytest.raises(ValueError, match=r"contact_gap: .*'surface': \(4, 3\)"):
         contact_gap(image, same, other, image, 1.0)
     with pytest.raises(ValueError, match=r"`occluder_distance` \(3, 4\), got \(2, 4\)"):

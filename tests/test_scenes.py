@@ -6,6 +6,8 @@ import pytest
 
 from experiments.scene import Material
 from experiments.scenes import EMBEDDED, SHADOW_SCENES, load_scene
+from experiments.scenes.failure_scenes import FAILURE_SCENES
+from shadows.area_lights import AreaLight
 from shadows.bias import CombinedBias, ConstantBias, SlopeBias
 from shadows.lights import DirectionalLight, PointLight, SpotLight
 from shadows.projector import Projector
@@ -63,7 +65,7 @@ def test_a_scene_is_sound(name):
     if isinstance(light, PointLight):
         assert np.isfinite(light.position).all()
         return
-    assert isinstance(light, DirectionalLight | SpotLight | Projector)
+    assert isinstance(light, DirectionalLight | SpotLight | Projector | AreaLight)
     np.testing.assert_allclose(np.linalg.norm(light.direction), 1, rtol=1e-6)
 
 
@@ -82,7 +84,7 @@ def test_a_name_that_is_nearly_right_gets_a_suggestion(name, hint):
 
 
 def test_a_name_that_is_nothing_lists_all_scenes():
-    with pytest.raises(ValueError, match=f"choose from: {', '.join(EMBEDDED)}$"):
+    with pytest.raises(ValueError, match=f"choose from: {', '.join(EMBEDDED | FAILURE_SCENES)}$"):
         load_scene("xyz")
 
 

@@ -64,6 +64,8 @@ class BiasSpace(eqx.Module):
         names: The free numbers, as ``constant.length``.
         units: The unit of each.
         free: For each number, whether it is free.
+        smooth: Whether a hard comparison may stay in a fit: the numbers move no depth, but
+            what a filter reads, and the truth has penumbrae that follow it.
     """
 
     template: tuple[CombinedBias, Filter, Compare]
@@ -72,6 +74,7 @@ class BiasSpace(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     units: tuple[str, ...] = eqx.field(static=True)
     free: tuple[bool, ...] = eqx.field(static=True)
+    smooth: bool = eqx.field(static=True)
 
     @staticmethod
     def of(
@@ -113,13 +116,14 @@ class BiasSpace(eqx.Module):
             chosen,
             tuple(known[name][1] for name in chosen),
             tuple(name in chosen for name in known),
+            bool(trial.soft) and not any(name in of_bias for name in chosen),
         )
 
     @property
     def softens(self) -> bool:
         """Whether a fit puts a soft comparison in place of a hard one."""
         _, filter, compare = self.template
-        return filter.compares and isinstance(compare, HardCompare)
+        return filter.compares and isinstance(compare, HardCompare) and not self.smooth
 
     @property
     def reads_anew(self) -> bool:

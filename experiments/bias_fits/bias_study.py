@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
+from shadows.area_lights import AreaLight
 from shadows.bias import Bias, CombinedBias
 from shadows.compare import Compare, HardCompare
 from shadows.filters import Filter, look_up
@@ -24,11 +25,19 @@ from tangentspace._math import dot
 from tangentspace.shading import Shading
 
 from ..checks import check_shadow_map
-from ..metrics import ShadowErrors, contact_gap, shadow_errors
+from ..metrics import (
+    ShadowErrors,
+    SoftShadowErrors,
+    contact_gap,
+    shadow_errors,
+    soft_shadow_errors,
+)
 from ..rendering.render_scene import render_scene, shade_scene
 from ..scene import Scene
+from ..truth.area import area_visibility
 from ..truth.rays import Occluders, nearest_occluder_distance, trace_visibility
 
+LIGHT_SAMPLES = 64  # points of an area light that rays go to; 1 % in a penumbra
 Techniques = tuple[CombinedBias, Filter, Compare]
 
 
@@ -72,6 +81,25 @@ class TruthGoal(Goal):
         return jnp.sum(wrong) / self.surface_count
 
 
+class ShareGoal(Goal):
+    """Ray-traced visibility of an area light.
+
+    Attributes:
+        share: Of the light, that is seen.
+    """
+
+    unit: ClassVar[str] = "rms of visibility at pixels that face the light"
+    share: Float[Array, " pixels"]
+
+    def residual(self, visibility: Float[Array, " pixels"]) -> Float[Array, " pixels"]:
+        """Return visibility minus truth."""
+        return visibility - self.share
+
+    def error(self, visibility: Float[Array, " pixels"]) -> Float[Array, ""]:
+        """Return the root mean square of the residual."""
+        return jnp.sqrt(jnp.mean(self.residual(visibility) ** 2))
+
+
 class ImageGoal(Goal):
     """A target image; the color is ``unlit + visibility * direct``.
 
@@ -106,12 +134,14 @@ class Trial(NamedTuple):
         reading: What the filter reads there while no texel moves.
         shadow_map: For biases and filters that read anew.
         goal: What visibility is compared with.
+        soft: Whether the light has a size, and truth penumbrae.
     """
 
     receiver: Receiver
     reading: PyTree
     shadow_map: ShadowMap
     goal: Goal
+    soft: bool = False
 
     def visibility(
         self, bias: Bias, filter: Filter, compare: Compare, *, anew: bool = False
@@ -150,8 +180,10 @@ class Study(NamedTuple):
         filter: How the map is asked.
         compare: How depths become visibility in the end.
         shading: How the pictures are lit.
-        truth: Ray-traced visibility.
-        occluder_distance: World length along the ray to what hides the light; inf if lit.
+        truth: Ray-traced visibility; of an area light, whether more than half of it is seen.
+        share: Of the light that is seen; 0 or 1 but for area lights.
+        occluder_distance: World length along the ray to what hides the light, or its centre;
+            inf if nothing does.
         facing: Pixels whose face is turned to the light.
         trial: What fits and sweeps work on.
     """
@@ -162,9 +194,15 @@ class Study(NamedTuple):
     compare: Compare
     shading: Shading
     truth: Bool[np.ndarray, "height width"]
+    share: Float[np.ndarray, "height width"]
     occluder_distance: Float[np.ndarray, "height width"]
     facing: Bool[np.ndarray, "height width"]
     trial: Trial
+
+    @property
+    def soft(self) -> bool:
+        """Whether the light has a size, and truth penumbrae."""
+        return self.trial.soft
 
     def visibility(self, bias: Bias | Techniques) -> Float[np.ndarray, "height width"]:
         """Return the image of visibility under a bias, or under other techniques too."""
@@ -182,18 +220,23 @@ class Study(NamedTuple):
         covered = np.asarray(self.unbiased.surface.covered)
         return shadow_errors(self.visibility(bias), self.truth, covered)
 
+    def soft_errors(self, bias: Bias | Techniques) -> SoftShadowErrors:
+        """Judge a bias against the share of the light that is seen."""
+        covered = np.asarray(self.unbiased.surface.covered)
+        return soft_shadow_errors(self.visibility(bias), self.share, covered)
+
     def objective(self, bias: Bias | Techniques) -> float:
         """Return the goal's error of a bias."""
         return float(self.trial.goal.error(self._at_pixels(bias)))
 
     def contact_gap(self, bias: Bias | Techniques) -> float:
-        """Return the world length of shadow that a bias takes away at contacts."""
+        """Return the world length of full shadow that a bias takes away at contacts."""
         surface = self.unbiased.surface
         to_light = self.scene.lights[0].to_light(surface.position)
         sin_angle = np.sqrt(np.maximum(1 - np.asarray(dot(surface.face_normal, to_light)) ** 2, 0))
         return contact_gap(
             self.visibility(bias),
-            self.truth,
+            self.share > 0,
             np.asarray(surface.covered),
             self.occluder_distance,
             sin_angle,
@@ -228,6 +271,8 @@ def prepare_study(
 ) -> Study:
     """Make both passes and trace the truth; the goal is that truth.
 
+    Of an area light truth is the share that is seen, by a ray to each of 64 points on it.
+
     Args:
         scene: What is seen; its first light counts.
         image_size: Height and width in pixels.
@@ -242,6 +287,7 @@ def prepare_study(
         ValueError: If nothing that is seen faces the light, or nothing is in its view.
     """
     scene = scene._replace(lights=scene.lights[:1])
+    filter = filter.for_light(scene.lights[0])
     unbiased = render_scene(
         scene,
         image_size=image_size,
@@ -261,17 +307,21 @@ def prepare_study(
         raise ValueError(f"{scene.name}: no visible surface faces the light; move light or camera")
     occluders = Occluders(scene.mesh.positions, scene.mesh.faces)
     position, normal = np.asarray(surface.position), np.asarray(surface.face_normal)
-    face_ids = np.asarray(surface.face_ids)
-    truth = trace_visibility(position, normal, face_ids, light, occluders)
-    distance = nearest_occluder_distance(position, normal, face_ids, light, occluders)
+    points = (position, normal, np.asarray(surface.face_ids))
+    if isinstance(light, AreaLight):
+        share = area_visibility(*points, light, occluders, samples=LIGHT_SAMPLES)
+        goal = ShareGoal(jnp.asarray(share[facing], jnp.float32))
+    else:
+        share = trace_visibility(*points, light, occluders).astype(np.float64)
+        count = jnp.sum(surface.covered).astype(jnp.float32)
+        goal = TruthGoal(jnp.asarray(share[facing], jnp.float32), count)
+    distance = nearest_occluder_distance(*points, light, occluders)
 
     at_pixels = _at_pixels(receiver, facing)
-    goal = TruthGoal(
-        jnp.asarray(truth[facing], jnp.float32), jnp.sum(surface.covered).astype(jnp.float32)
-    )
     reading = filter.read(filter.prepare(bias.prepare(shadow_map)), at_pixels)
-    trial = Trial(at_pixels, reading, shadow_map, goal)
-    return Study(scene, unbiased, filter, compare, shading, truth, distance, facing, trial)
+    trial = Trial(at_pixels, reading, shadow_map, goal, isinstance(light, AreaLight))
+    seen = (share > 0.5, share, distance, facing)
+    return Study(scene, unbiased, filter, compare, shading, *seen, trial)
 
 
 def _at_pixels(receiver: Receiver, chosen: Bool[np.ndarray, "height width"]) -> Receiver:

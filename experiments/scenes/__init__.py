@@ -1,7 +1,8 @@
 """Scenes made by code, each for a failure it shows; ``load_scene`` finds them by name.
 
 World units are arbitrary; each scene is a few units wide. Elevations are angles of the
-light over the floor. A new scene is a new function in one of the tables below.
+light over the floor. A new scene is a new function in one of the tables below; those of the
+failure catalogue are in ``failure_scenes``.
 """
 
 from collections.abc import Callable
@@ -15,8 +16,9 @@ from tangentspace.shapes import box, icosphere, plane
 from ..files.mesh_file import load_scene_file
 from ..options import hint
 from ..scene import Scene
+from .failure_scenes import FAILURE_SCENES
 from .layout_scenes import avenue, room
-from .light_scenes import projector, skylights
+from .light_scenes import projector, skylights, soft_lamp
 from .mapped_scenes import bumpy, displaced, mirror, normal_cells
 from .relief import relief, shadowed_relief
 from .staging import placed, staged, sun
@@ -92,6 +94,7 @@ MAPPED_SCENES: dict[str, Callable[[], Scene]] = {
 LIGHT_SCENES: dict[str, Callable[[], Scene]] = {
     "projector": projector,
     "skylights": skylights,
+    "soft-lamp": soft_lamp,
     "room": room,
     "avenue": avenue,
 }
@@ -104,10 +107,11 @@ def load_scene(name: str) -> Scene:
     Raises:
         ValueError: If the name is neither an embedded scene nor a readable file.
     """
-    if name in EMBEDDED:
-        return EMBEDDED[name]()
+    known = EMBEDDED | FAILURE_SCENES
+    if name in known:
+        return known[name]()
     if not Path(name).exists() and not Path(name).suffix:
         raise ValueError(
-            f"scene '{name}': neither a file nor an embedded scene; {hint(name, EMBEDDED)}"
+            f"scene '{name}': neither a file nor an embedded scene; {hint(name, known)}"
         )
     return load_scene_file(name)

@@ -3,6 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
+from shadows.area_lights import DiscLight
 from shadows.lights import DirectionalLight
 from shadows.projector import Projector
 from tangentspace.shapes import box, icosphere, plane
@@ -40,6 +41,22 @@ def skylights() -> Scene:
     light = DirectionalLight(sun(62.0, 90.0).direction, np.array([4.0, 3.6, 3.0], np.float32))
     parts = [plane(3.0), *boards, *sides, wall, ball]
     return staged("skylights", parts, eye=(0.3, 1.0, 2.9), light=light)
+
+
+def soft_lamp() -> Scene:
+    """A round lamp over a gate, a ball and plates: penumbrae grow from contact with the gap."""
+    gate = [placed(box((0.05, 0.5, 0.05)), (x, 0.5, -0.2)) for x in (-1.3, -0.15)]
+    gate.append(placed(box((0.625, 0.05, 0.05)), (-0.725, 1.05, -0.2)))
+    ball = placed(icosphere(0.22, subdivisions=4), (-0.35, 0.22, 0.85))
+    plates = [
+        placed(box((0.2, 0.02, 0.2)), (x, height, z))
+        for x, height, z in ((0.45, 0.05, 1.05), (0.75, 0.3, 0.35), (0.5, 0.7, -0.6))
+    ]
+    position, target = np.array([-0.9, 3.0, 1.6]), np.array([0.1, 0.0, 0.0])
+    direction = (target - position) / np.linalg.norm(target - position)
+    light = DiscLight(position.astype(np.float32), direction.astype(np.float32), radius=0.25)
+    parts = [plane(2.0), *gate, ball, *plates]
+    return staged("soft-lamp", parts, eye=(0.7, 2.3, 3.6), light=light)
 
 
 def _slide(height: int, width: int) -> Float[np.ndarray, "{height} {width} 3"]:
