@@ -155,4 +155,6 @@ def _of_bias(free: Sequence[str], light: Light) -> bool:
 
 def _bias_words(filter: Filter, of_bias: bool) -> tuple[str, ...]:
     """Return the bias that is meant where none is named."""
-    return ("constant", "slope") if of_bias else (technique_name(type(default_bias(filter))),)
+    if of_bias:
+        return ("constant", "slope")
+    return (technique_name(type(default_bias(filter))),) if filter.needs_bias else ()
