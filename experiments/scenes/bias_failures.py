@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from shadows.lights import Light
+from shadows.lights import DirectionalLight, Light
 from shadows.transforms import look_at
 from tangentspace.mesh import Mesh
 from tangentspace.shapes import box, icosphere, plane, transform_mesh
@@ -38,8 +38,10 @@ def turned_plane(azimuth: float = 45.0) -> Scene:
         azimuth: Of the turn, degrees.
     """
     scene = tilted_plane()
+    light = scene.lights[0]
+    assert isinstance(light, DirectionalLight)
     turn = np.eye(4)
-    turn[:3, :3] = _rotation(scene.lights[0].direction, np.deg2rad(azimuth))
+    turn[:3, :3] = _rotation(np.asarray(light.direction), np.deg2rad(azimuth))
     view = np.asarray(scene.camera.view_from_world @ turn.T, np.float32)
     return scene._replace(
         name="turned-plane",
