@@ -118,8 +118,9 @@ def _lower_weight(
     place = jnp.where(mirrored, -place, place)
     root = jnp.sqrt(middle * middle + 4 * apart * (excess + apart))
     total = jnp.abs(middle) + root
-    near = (0.5 * place * total + apart) * total
-    near = near / (root * (place * total + 2 * (excess + apart)))
+    # Two quotients: the square of one divisor of all would leave the exponent's range.
+    near = (0.5 * place * total + apart) / (place * total + 2 * (excess + apart))
+    near = near * (total / root)
     return jnp.where(mirrored, 1 - weight - near, near)
 
 

@@ -18,6 +18,7 @@ from ..console import say, say_notes, stage
 from ..figures import on_background
 from ..files.images import Channels, write_exr, write_png
 from ..scenes import EMBEDDED, load_scene
+from ..scenes.failure_scenes import FAILURE_SCENES
 from ..technique_words import (
     BiasWords,
     CompareWords,
@@ -38,7 +39,8 @@ SceneName = Annotated[
     tyro.conf.Positional,
     tyro.conf.arg(
         metavar="SCENE",
-        help=f"A mesh or glTF file (.obj .ply .stl .gltf .glb), or one of: {', '.join(EMBEDDED)}.",
+        help=f"A mesh or glTF file (.obj .ply .stl .gltf .glb), or one of: {', '.join(EMBEDDED)}; "
+        f"scenes that break techniques: {', '.join(FAILURE_SCENES)}.",
     ),
 ]
 ImageSize = Annotated[tuple[int, int], tyro.conf.arg(metavar="H W", help="Pixels of the image.")]
