@@ -13,9 +13,7 @@ of a variance. A texel without a surface is one at the far end. The map's border
 
 import abc
 import functools
-import itertools
 import math
-from collections.abc import Iterable, Iterator
 from typing import ClassVar, Literal, NamedTuple
 
 import equinox as eqx
@@ -102,10 +100,8 @@ class MomentFilter(Filter):
         coarser = np.ceil(self.level) if known else jnp.ceil(self.level)
         return self.radius + 1.5 * 2.0**coarser - 0.5
 
-    def prepare(self, shadow_map: ShadowMap) -> tuple[tuple[Array, ...], ...]:
+    def prepare(self, shadow_map: ShadowMap) -> tuple[Moments, ...]:
         """Return the blurred images, those of the full size first.
-
-        Two and two as the parts of complex numbers, which are read at once.
 
         Raises:
             ValueError: If the map is too small for the radius, or its sides cannot be halved
@@ -119,9 +115,9 @@ class MomentFilter(Filter):
         levels = [tuple(self._blurred(image) for image in stored)]
         for _ in range(self.mips):
             levels.append(tuple(_halved(image) for image in levels[-1]))
-        return tuple(tuple(_paired(level)) for level in levels)
+        return tuple(levels)
 
-    def read(self, prepared: tuple[tuple[Array, ...], ...], receiver: Receiver) -> MomentReading:
+    def read(self, prepared: tuple[Moments, ...], receiver: Receiver) -> MomentReading:
         """Read 2x2 texels at each receiver, in one level or two."""
         height, width = prepared[0][0].shape[-2:]
         inside = _share_inside(receiver.column, width) * _share_inside(receiver.row, height)
@@ -238,7 +234,7 @@ def _share_inside(place: Float[Array, "*points"], size: int) -> Float[Array, "*p
     return jnp.clip(place + 0.5, 0, 1) * jnp.clip(size + 0.5 - place, 0, 1)
 
 
-def _bilinear(images: tuple[Array, ...], receiver: Receiver, level: int) -> Moments:
+def _bilinear(images: Moments, receiver: Receiver, level: int) -> Moments:
     """Read the 2x2 texels round each receiver in images of a level; the border repeats."""
     height, width = images[0].shape[-2:]
     left, to_right, across = _nearest_two(receiver.column / 2**level, width)
@@ -248,7 +244,7 @@ def _bilinear(images: tuple[Array, ...], receiver: Receiver, level: int) -> Mome
         corner = corner + receiver.map_index * (height * width)
     to_left, to_top, total = 1 - to_right, 1 - to_low, (1 - to_low) + to_low
 
-    def read(image: Array) -> Array:
+    def read(image: Float[Array, "..."]) -> Float[Array, "*points"]:
         texels = image.reshape(-1)
         at = lambda offset: texels.at[corner + offset].get(mode="promise_in_bounds")
         # Weighted sums: a difference of texels that are powers of ten apart loses the smaller.
@@ -256,17 +252,7 @@ def _bilinear(images: tuple[Array, ...], receiver: Receiver, level: int) -> Mome
         # Divided by a sum that is 1: without, XLA reads and blends again for each use.
         return (to_top * high + to_low * low) / total
 
-    return tuple(_parted(map(read, images)))
-
-
-def _paired(images: Moments) -> Iterator[Array]:
-    for first, second in itertools.zip_longest(images[::2], images[1::2]):
-        yield first if second is None else lax.complex(first, second)
-
-
-def _parted(images: Iterable[Array]) -> Iterator[Array]:
-    for image in images:
-        yield from (image.real, image.imag) if jnp.iscomplexobj(image) else (image,)
+    return tuple(read(image) for image in images)
 
 
 def _nearest_two(

@@ -161,7 +161,7 @@ def test_blur_of_one_texel(radius, blur):
     size = 16
     deep = jnp.full((size, size), 0.5).at[8, 7].set(1.0)
     filter = VSMFilter(radius=radius, blur=blur)
-    mean = np.asarray(prepare(filter, ShadowMap(deep, jnp.eye(4)))[0][0].real)
+    mean = np.asarray(prepare(filter, ShadowMap(deep, jnp.eye(4)))[0][0])
     weights = kernel_reference(radius, blur)
     assert len(weights) == 2 * radius + 1
     window = slice(8 - radius, 9 + radius), slice(7 - radius, 8 + radius)
@@ -184,7 +184,7 @@ def test_mips_are_means():
     signed = 2 * depth - 1
     assert [level[0].shape for level in levels] == [(12, 16), (6, 8), (3, 4)]
     for k, level in enumerate(levels):
-        for power, image in enumerate((level[0].real, level[0].imag), 1):
+        for power, image in enumerate(level, 1):
             blocks = (signed**power).reshape(12 // 2**k, 2**k, 16 // 2**k, 2**k)
             assert_close(image, blocks.mean(axis=(1, 3)))
 
