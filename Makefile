@@ -25,7 +25,8 @@ render: $(VENV)/run.stamp ## render a scene with its shadow map, into results/re
 	  --png-out results/render/image.png --shadow-map-out results/render/shadow_map.exr
 
 test: $(VENV)/test.stamp ## run the tests
-	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile $(PYTEST_ARGS)
+	$(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile \
+	  --no-loadscope-reorder $(PYTEST_ARGS)
 
 style: $(VENV)/dev.stamp ## check the form of the code
 	$(BIN)/ruff check

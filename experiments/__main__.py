@@ -34,6 +34,7 @@ def _run(arguments: Sequence[str]) -> int:
     from .baking.bake_command import bake
     from .baking.bake_light_command import bake as bake_light
     from .bias_fits.fit_bias_command import fit as fit_bias
+    from .frontier.command import frontier
     from .normal_map_fits.fit_normal_map_command import fit as fit_normal_map
     from .rendering.render_command import render
 
@@ -43,6 +44,7 @@ def _run(arguments: Sequence[str]) -> int:
         "fit-normal-map": fit_normal_map,
         "bake-normals": bake,
         "bake-light": bake_light,
+        "frontier": frontier,
     }
     try:
         _parse(arguments, commands)()

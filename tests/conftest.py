@@ -21,6 +21,16 @@ hypothesis.settings.register_profile("tests", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("tests")
 
 
+# Files of minutes come first, so that no process is alone with one in the end.
+_LONG = ("test_notebooks", "test_failure_scenes", "test_soft_truth", "test_frontier")
+
+
+def pytest_collection_modifyitems(items):
+    """Order the tests by file, long ones first."""
+    place = {name: k for k, name in enumerate(_LONG)}
+    items.sort(key=lambda item: place.get(item.path.stem, len(_LONG)))
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _compiled_functions_end_with_their_module():
     """Free what a module compiled: some thousand programs exceed what a process may map."""
