@@ -214,6 +214,22 @@ def keep_slope(function: Callable, with_slope: Callable | None = None) -> Callab
 _compared = keep_slope(_compare, _compare_with_slope)
 
 
+def keep_bias_slope(visibility: Callable) -> Callable:
+    """Decorate a filter's ``visibility``: ``keep_slope`` in the receiver's bias."""
+
+    @keep_slope
+    def after_bias(
+        depth_bias: Array, filter: Filter, reading: Any, receiver: Receiver, compare: Compare
+    ) -> Array:
+        return visibility(filter, reading, receiver._replace(depth_bias=depth_bias), compare)
+
+    @functools.wraps(visibility)
+    def kept(filter: Filter, reading: Any, receiver: Receiver, compare: Compare) -> Array:
+        return after_bias(receiver.depth_bias, filter, reading, receiver, compare)
+
+    return kept
+
+
 def look_up(
     shadow_map: ShadowMap, receiver: Receiver, *, filter: Filter, compare: Compare
 ) -> Float[Array, "*points"]:

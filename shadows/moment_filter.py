@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int
 
 from ._checks import check_field
 from .compare import Compare
-from .filters import Filter, keep_slope
+from .filters import Filter, keep_bias_slope
 from .shadow_map import Receiver, ShadowMap
 from .transforms import Scalar
 
@@ -134,19 +134,15 @@ class MomentFilter(Filter):
         branches = [functools.partial(between, k) for k in range(self.mips)]
         return MomentReading(lax.switch(finer.astype(jnp.int32), branches), inside)
 
+    @keep_bias_slope
     def visibility(
         self, reading: MomentReading, receiver: Receiver, compare: Compare
     ) -> Float[Array, "*points"]:
         """Return what the means tell of receivers after their bias; nothing is compared."""
-        return _lit_after_bias(receiver.depth_bias, self, reading, receiver)
-
-    def _lit_after_bias(
-        self, depth_bias: Float[Array, "*points"], reading: MomentReading, receiver: Receiver
-    ) -> Float[Array, "*points"]:
         ratio = depth_ratio(receiver.texel_from_world)
         if receiver.map_index is not None:
             ratio = ratio[receiver.map_index]
-        depth = _signed(linear_depth(receiver.depth - depth_bias, ratio))
+        depth = _signed(linear_depth(receiver.depth - receiver.depth_bias, ratio))
         inside, outside = reading.inside, 1 - reading.inside
         # Divided by a sum that is 1: without, XLA computes it again for each color channel.
         lit = (inside * self.lit(reading.moments, depth) + outside) / (inside + outside)
@@ -172,11 +168,6 @@ class MomentFilter(Filter):
                 f"{name}: expected a map whose sides can be halved {self.mips} times (`mips`), "
                 f"got {size}"
             )
-
-
-_lit_after_bias = keep_slope(
-    lambda depth_bias, filter, *rest: filter._lit_after_bias(depth_bias, *rest)
-)
 
 
 def depth_ratio(texel_from_world: Float[Array, "*maps 4 4"]) -> Float[Array, "*maps"]:

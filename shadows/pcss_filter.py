@@ -18,7 +18,7 @@ from ._checks import check_field
 from .area_lights import AreaLight
 from .compare import Compare, SoftCompare
 from .disc_filters import poisson_disc, read_disc
-from .filters import Filter, compare_taps, keep_slope
+from .filters import Filter, compare_taps, keep_bias_slope
 from .lights import Light
 from .shadow_map import Receiver, ShadowMap
 from .transforms import Scalar
@@ -79,15 +79,11 @@ class PCSSFilter(Filter):
         """Return the map: where it is read depends on the receiver's depth."""
         return prepared
 
+    @keep_bias_slope
     def visibility(
         self, reading: ShadowMap, receiver: Receiver, compare: Compare
     ) -> Float[Array, "*points"]:
         """Look for blockers, and filter as wide as they say."""
-        return _after_bias(receiver.depth_bias, self, reading, receiver, compare)
-
-    def _visibility(
-        self, reading: ShadowMap, receiver: Receiver, compare: Compare
-    ) -> Float[Array, "*points"]:
         # The farthest that a blocker may be: at the near end of the map.
         farthest = _ray_length(receiver, receiver.depth)
         search = self._radius(receiver, farthest)
@@ -116,17 +112,6 @@ class PCSSFilter(Filter):
         size = _SIZE if self.light_size is None else self.light_size
         width = gap * widening * size
         return jnp.clip(0.5 * width / receiver.texel_length, 0.0, self.widest)
-
-
-@keep_slope
-def _after_bias(
-    depth_bias: Float[Array, "*points"],
-    filter: PCSSFilter,
-    reading: ShadowMap,
-    receiver: Receiver,
-    compare: Compare,
-) -> Float[Array, "*points"]:
-    return filter._visibility(reading, receiver._replace(depth_bias=depth_bias), compare)
 
 
 def _seeking(count: int) -> Float[np.ndarray, "points 2"]:

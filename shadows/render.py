@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from tangentspace._math import dot
 from tangentspace.environment import CubeMap, reflect_environment, skybox
@@ -22,7 +22,7 @@ from tangentspace.shading import BlinnPhongShading, Shading
 from .appearance import Appearance, surface_appearance
 from .bias import AnalyticBias, Bias, CombinedBias
 from .compare import Compare, HardCompare
-from .filters import Filter, look_up
+from .filters import Filter
 from .layouts import Layout, SingleLayout
 from .lights import Light
 from .plane_bias import AdaptiveBias
@@ -80,15 +80,28 @@ def surface_visibility(
     bias: Bias,
     filter: Filter,
     compare: Compare,
+    prepared: PyTree = None,
 ) -> Float[Array, "height width"]:
-    """Return the light's visibility at each pixel; 0 on faces turned away from the light."""
+    """Return the light's visibility at each pixel; 0 on faces turned away from the light.
+
+    Args:
+        surface: What the eye sees.
+        light: The light.
+        shadow_map: Its map.
+        bias: Against self-shadowing.
+        filter: How the map is asked.
+        compare: Hard, or soft where derivatives are wanted.
+        prepared: ``filter.prepare(bias.prepare(shadow_map))``, if it was kept.
+    """
     check_techniques(bias, filter)
     filter = filter.for_light(light)
     reach = filter.reach()
     receiver = receive_surface(surface, light, shadow_map, reach=reach)
     facing = dot(receiver.normal, receiver.to_light) > 0
     moved = bias(receiver, reach)
-    visibility = look_up(bias.prepare(shadow_map), moved, filter=filter, compare=compare)
+    if prepared is None:
+        prepared = filter.prepare(bias.prepare(shadow_map))
+    visibility = filter.visibility(filter.read(prepared, moved), moved, compare)
     return jnp.where(facing & surface.covered, visibility, 0.0)
 
 

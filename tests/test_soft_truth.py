@@ -12,19 +12,13 @@ import pytest
 
 from experiments.__main__ import main
 from experiments.bias_fits.bias_space import BiasSpace
-from experiments.bias_fits.bias_study import (
-    LIGHT_SAMPLES,
-    ShareGoal,
-    TruthGoal,
-    prepare_study,
-    with_target,
-)
+from experiments.bias_fits.bias_study import ShareGoal, TruthGoal, prepare_study, with_target
 from experiments.bias_fits.fit_bias import fit_bias
 from experiments.bias_fits.sweep_bias import sweep_bias
 from experiments.figures import soft_error_picture
 from experiments.scenes.light_scenes import soft_lamp
 from experiments.scenes.staging import placed, staged
-from experiments.truth.area import area_visibility
+from experiments.truth.area import LIGHT_SAMPLES, area_visibility
 from experiments.truth.rays import Occluders
 from shadows import (
     AdaptiveBias,

@@ -1,8 +1,8 @@
 """Time every shadow technique: ``python -m experiments.benchmarks.techniques --out FILE.json``.
 
 An image of 512 x 512 pixels with a map of 1024 x 1024 texels, both rasterizations kept:
-what a technique costs from there on, with its gradient in the bias (or in the filter's own
-numbers), and the bytes that it keeps beside the map. What a filter prepares from the map
+what a technique costs from there on, with its gradient in a bias,
+and the bytes that it keeps beside the map. What a filter prepares from the map
 alone is timed apart. Run it on an idle machine.
 """
 
@@ -28,14 +28,13 @@ from shadows.layouts import Layout, SingleLayout
 from shadows.light_map import LightMap, look_up_light, shade_with_light_map
 from shadows.lights import Light, PointLight
 from shadows.medium import Medium
-from shadows.render import Rendering, default_bias, receive_surface, shade
+from shadows.render import Rendering, default_bias, shade, surface_visibility
 from shadows.shadow_map import ShadowMap, render_shadow_map
 from shadows.shafts import add_shafts
 from shadows.silhouettes import mesh_edges
 from shadows.surface import Surface, render_surface
 from shadows.volumes import volume_visibility
 from shadows.window_filters import BilinearFilter, PCFFilter, TentFilter
-from tangentspace._math import dot
 
 from ..baking.bake_light import bake_light_map
 from ..checks import check_out
@@ -153,12 +152,8 @@ def _functions(light: Light, filter: Filter, bias: Bias) -> tuple[Any, Any, Any]
 
     def visibility(bias: Bias, filter: Filter, surface: Surface, prepared: Any) -> Array:
         shadow_map, of_filter = prepared
-        reach = filter.reach()
-        receiver = receive_surface(surface, light, shadow_map, reach=reach)
-        facing = dot(receiver.normal, receiver.to_light) > 0
-        reading = filter.read(of_filter, receiver)
-        seen = filter.visibility(reading, bias(receiver, reach), _SOFT)
-        return jnp.where(facing & surface.covered, seen, 0.0)
+        how = {"bias": bias, "filter": filter, "compare": _SOFT, "prepared": of_filter}
+        return surface_visibility(surface, light, shadow_map, **how)
 
     def prepare(shadow_map: ShadowMap) -> Any:
         return shadow_map, filter.prepare(bias.prepare(shadow_map))

@@ -34,10 +34,9 @@ from ..metrics import (
 )
 from ..rendering.render_scene import render_scene, shade_scene
 from ..scene import Scene
-from ..truth.area import area_visibility
-from ..truth.rays import Occluders, nearest_occluder_distance, trace_visibility
+from ..truth.area import seen_share
+from ..truth.rays import Occluders, nearest_occluder_distance
 
-LIGHT_SAMPLES = 64  # points of an area light that rays go to; 1 % in a penumbra
 Techniques = tuple[CombinedBias, Filter, Compare]
 
 
@@ -308,11 +307,10 @@ def prepare_study(
     occluders = Occluders(scene.mesh.positions, scene.mesh.faces)
     position, normal = np.asarray(surface.position), np.asarray(surface.face_normal)
     points = (position, normal, np.asarray(surface.face_ids))
+    share = seen_share(*points, light, occluders)
     if isinstance(light, AreaLight):
-        share = area_visibility(*points, light, occluders, samples=LIGHT_SAMPLES)
         goal = ShareGoal(jnp.asarray(share[facing], jnp.float32))
     else:
-        share = trace_visibility(*points, light, occluders).astype(np.float64)
         count = jnp.sum(surface.covered).astype(jnp.float32)
         goal = TruthGoal(jnp.asarray(share[facing], jnp.float32), count)
     distance = nearest_occluder_distance(*points, light, occluders)

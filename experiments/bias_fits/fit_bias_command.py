@@ -142,8 +142,7 @@ def fit(
         "image_size": list(image_size), "shadow_map_size": shadow_map_size,
         "shading": list(shading),
     }  # fmt: skip
-    write_summary(outcome, settings, out)
-    print_table(outcome)
+    print_table(outcome, write_summary(outcome, settings, out))
     say(f"pictures and numbers: {out} (start with comparison.png; figures in summary.json)")
 
 

@@ -25,7 +25,8 @@ from ..metrics import ShadowErrors, SoftShadowErrors
 from ..options import numbers, technique_name
 from ..provenance import commit, device, versions
 from ..rendering.render_command import image_channels, shadow_map_channels
-from .bias_study import LIGHT_SAMPLES, ImageGoal, Study, Techniques
+from ..truth.area import LIGHT_SAMPLES
+from .bias_study import ImageGoal, Study, Techniques
 from .fit_bias import BiasFit
 from .sweep_bias import BiasSweep
 
@@ -189,12 +190,14 @@ def _write_error_curve(outcome: Outcome, out: Path) -> None:
     )
 
 
-def write_summary(outcome: Outcome, settings: Mapping[str, Any], out: Path) -> None:
-    """Write every figure to summary.json."""
+def write_summary(outcome: Outcome, settings: Mapping[str, Any], out: Path) -> dict[str, Any]:
+    """Write every figure to summary.json, and return them."""
     made_with = {"versions": versions(), "device": device(), "commit": commit()}
-    content = {"settings": settings, **_summary(outcome), **made_with}
+    summary = _summary(outcome)
+    content = {"settings": settings, **summary, **made_with}
     with atomic_path(out / "summary.json") as temporary:
         temporary.write_text(json.dumps(content, indent=2) + "\n", "utf-8")
+    return summary
 
 
 def _hard_summary(outcome: Outcome) -> dict[str, Any]:
@@ -250,7 +253,7 @@ def _light_size(study: Study) -> float | None:
     return float(light.diameter) if isinstance(light, AreaLight) else None
 
 
-def print_table(outcome: Outcome) -> None:
+def print_table(outcome: Outcome, summary: Mapping[str, Any]) -> None:
     """Show the figures that matter most."""
     study, _, fitted, swept, _ = outcome
     cost = {
@@ -258,10 +261,7 @@ def print_table(outcome: Outcome) -> None:
         "after": (str(fitted.evaluations), f"{fitted.seconds:.2f}"),
         "sweep_best": (str(swept.evaluations), f"{swept.seconds:.2f}"),
     }
-    rows = [
-        [outcome.names[name], *_cells(study, choice), *cost[name]]
-        for name, choice in outcome.compared.items()
-    ]
+    rows = [[outcome.names[name], *_cells(summary, name), *cost[name]] for name in outcome.compared]
     columns = ["rmse", "in penumbra"] if study.soft else ["error", "off edges"]
     header = ["bias", "acne", "leak", *columns, "gap", "tried", "seconds"]
     say_table(study.scene.name, header, rows)
@@ -282,11 +282,12 @@ def print_table(outcome: Outcome) -> None:
         say(f"undetermined: {sentence}")
 
 
-def _cells(study: Study, choice: Techniques) -> list[str]:
+def _cells(summary: Mapping[str, Any], name: str) -> list[str]:
     """Return the errors in a row of the table."""
-    gap = f"{study.contact_gap(choice):.3g}"
-    if study.soft:
-        e = study.soft_errors(choice)
-        return [f"{e.acne:.3%}", f"{e.leak:.3%}", f"{e.rmse:.4f}", f"{e.rmse_penumbra:.4f}", gap]
-    e = study.errors(choice)
-    return [f"{e.acne:.3%}", f"{e.leak:.3%}", f"{e.error:.3%}", f"{e.error_interior:.3%}", gap]
+    columns = {"acne": ".3%", "leak": ".3%"}
+    if "rmse" in summary:
+        columns |= {"rmse": ".4f", "rmse_penumbra": ".4f"}
+    else:
+        columns |= {"error": ".3%", "error_interior": ".3%"}
+    columns["contact_gap"] = ".3g"
+    return [format(summary[column][name], form) for column, form in columns.items()]

@@ -12,7 +12,7 @@ from ..files.images import atomic_path
 
 ERRORS = ("rmse", "error", "flip")
 _COLORS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#000000", "#999933")
-_MARKERS = "osD^vP*Xhp<>"
+_MARKERS = "osD^vP*X<>ph"  # those of one color unlike each other
 _COLUMNS = 3
 
 

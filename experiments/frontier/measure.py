@@ -7,6 +7,7 @@ next scene.
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import flip_evaluator
@@ -18,12 +19,14 @@ from jaxtyping import Array, Float
 from shadows.bias import Bias, CombinedBias, ConstantBias, SlopeBias
 from shadows.compare import Compare, HardCompare, SoftCompare
 from shadows.filters import Filter
+from shadows.layouts import Layout
 from shadows.lights import Light
 from shadows.plane_bias import AdaptiveBias
-from shadows.render import receive_surface, shade
-from shadows.shadow_map import ShadowMap
+from shadows.render import shade, surface_visibility
+from shadows.shadow_map import ShadowMap, render_shadow_map
 from shadows.surface import Surface
-from tangentspace._math import dot
+from shadows.transforms import Camera
+from tangentspace.mesh import Mesh
 
 from ..files.images import linear_to_srgb
 from ..metrics import shadow_errors, soft_shadow_errors
@@ -72,24 +75,28 @@ class Passes:
         self._view, self._method, self._programs = view, method, programs
         self.filter = method.filter().for_light(view.light)
         reach = jnp.float32(self.filter.reach())
-        self._mesh = view.scene.mesh
+        scene = view.scene
         self._draw = self._get(
-            f"draw {view.name}",
-            lambda mesh, light, reach: view.draw(method.map_size, mesh, light, reach),
-            (self._mesh, view.light, reach),
+            f"draw {method.map_size}",
+            partial(_draw, method.map_size),
+            (view.layout, scene.mesh, scene.camera, view.light, reach),
         )
         shadow_map = self._draw()
-        self._prepare = self._get("prepare", self.filter.prepare, (shadow_map,))
+        self._prepare = self._get(f"prepare {method.name}", self.filter.prepare, (shadow_map,))
         self._kept = shadow_map, self._prepare()
 
     def image(self, bias: Bias) -> "Timed":
         """Return the program that asks the map: visibility and color."""
-        return self._get("image", _image, (bias, self.filter, self._shared()))
+        return self._get(f"image {self._method.name}", _image, (bias, self.filter, self._shared()))
 
     def gradient(self, bias: Bias) -> "Timed":
         """Return the program of a loss against truth and its derivative in a bias."""
         share = jnp.asarray(self._view.share, jnp.float32)
-        return self._get("gradient", _loss_gradient, (bias, self.filter, share, self._shared()))
+        return self._get(
+            f"gradient {self._method.name}",
+            _loss_gradient,
+            (bias, self.filter, share, self._shared()),
+        )
 
     @property
     def stages(self) -> "dict[str, Timed]":
@@ -106,8 +113,7 @@ class Passes:
 
     def _get(self, name: str, function: Callable, arguments: tuple) -> "Timed":
         arguments = jax.tree.map(jnp.asarray, arguments)
-        full = f"{name} {self._method.name}"
-        return Timed(*self._programs.get(full, function, *arguments), arguments)
+        return Timed(*self._programs.get(name, function, *arguments), arguments)
 
 
 class Timed:
@@ -220,16 +226,23 @@ def _said(bias: Bias) -> str:
     return " and ".join(said) or "none"
 
 
+def _draw(
+    map_size: int, layout: Layout, mesh: Mesh, camera: Camera, light: Light, reach: Array
+) -> ShadowMap:
+    """Return the light's map; the pass is the same for every filter."""
+    matrices = layout.matrices(
+        light, mesh.positions, camera, aspect=1.0, map_size=map_size, reach=reach
+    )
+    return render_shadow_map(mesh.positions, mesh.faces, matrices, map_size=map_size)
+
+
 def _visibility(
     bias: Bias, filter: Filter, compare: Compare, shared: Shared
 ) -> Float[Array, "height width"]:
     light, surface, shadow_map, prepared = shared
-    reach = filter.reach()
-    receiver = receive_surface(surface, light, shadow_map, reach=reach)
-    facing = dot(receiver.normal, receiver.to_light) > 0
-    reading = filter.read(prepared, receiver)
-    seen = filter.visibility(reading, bias(receiver, reach), compare)
-    return jnp.where(facing & surface.covered, seen, 0.0)
+    return surface_visibility(
+        surface, light, shadow_map, bias=bias, filter=filter, compare=compare, prepared=prepared
+    )
 
 
 def _image(

@@ -5,26 +5,22 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
 from shadows.area_lights import AreaLight
 from shadows.layouts import Layout
 from shadows.lights import Light
 from shadows.render import shade
-from shadows.shadow_map import ShadowMap, render_shadow_map
 from shadows.surface import Surface, render_surface
 from tangentspace._math import dot
-from tangentspace.mesh import Mesh
 
 from ..checks import check_scene
 from ..rendering.prepare_scene import prepare_scene
 from ..scene import Scene
 from ..scenes import load_scene
 from ..technique_words import choose_layout
-from ..truth.area import area_visibility
-from ..truth.rays import Occluders, trace_visibility
-
-LIGHT_SAMPLES = 64  # points of an area light that rays go to
+from ..truth.area import seen_share
+from ..truth.rays import Occluders
 
 
 class View(NamedTuple):
@@ -55,13 +51,6 @@ class View(NamedTuple):
         """Whether the light has a size, and truth penumbrae."""
         return isinstance(self.light, AreaLight)
 
-    def draw(self, map_size: int, mesh: Mesh, light: Light, reach: Array) -> ShadowMap:
-        """Return the light's map; the light's pass of every method."""
-        matrices = self.layout.matrices(
-            light, mesh.positions, self.scene.camera, aspect=1.0, map_size=map_size, reach=reach
-        )
-        return render_shadow_map(mesh.positions, mesh.faces, matrices, map_size=map_size)
-
 
 def load_view(name: str, image_size: int) -> View:
     """Load a scene, look at it and trace its truth.
@@ -79,10 +68,7 @@ def load_view(name: str, image_size: int) -> View:
     position, normal = np.asarray(surface.position), np.asarray(surface.face_normal)
     places = position, normal, np.asarray(surface.face_ids)
     occluders = Occluders(scene.mesh.positions, scene.mesh.faces)
-    if isinstance(light, AreaLight):
-        seen = area_visibility(*places, light, occluders, samples=LIGHT_SAMPLES)
-    else:
-        seen = trace_visibility(*places, light, occluders)
+    seen = seen_share(*places, light, occluders)
     towards = np.asarray(dot(surface.face_normal, light.to_light(surface.position)))
     facing = np.asarray(surface.covered) & (towards > 0)
     share = np.where(facing, seen, 0.0)

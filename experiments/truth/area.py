@@ -1,12 +1,31 @@
-"""Ray-traced soft shadows: the share of an area light that each surface point sees."""
+"""Ray-traced soft shadows: the share of a light that each surface point sees."""
 
 import numpy as np
 from jaxtyping import Float
 
 from shadows.area_lights import AreaLight
-from shadows.lights import PointLight
+from shadows.lights import Light, PointLight
 
 from .rays import FaceIds, Occluders, Vectors, trace_visibility
+
+LIGHT_SAMPLES = 64  # points of an area light that rays go to; 1 % in a penumbra
+
+
+def seen_share(
+    positions: Vectors,
+    geometric_normals: Vectors,
+    face_ids: FaceIds,
+    light: Light,
+    occluders: Occluders,
+) -> Float[np.ndarray, "*image"]:
+    """Return the share of any light that each surface point sees; 0 or 1 but for area lights.
+
+    Takes and raises what ``area_visibility`` does, with ``LIGHT_SAMPLES`` points.
+    """
+    points = (positions, geometric_normals, face_ids)
+    if isinstance(light, AreaLight):
+        return area_visibility(*points, light, occluders, samples=LIGHT_SAMPLES)
+    return trace_visibility(*points, light, occluders).astype(np.float64)
 
 
 def area_visibility(
