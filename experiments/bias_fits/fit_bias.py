@@ -112,40 +112,76 @@ def fit_bias(
     Raises:
         ValueError: If a name is not one of the bias's numbers.
     """
+    (fitted,) = fit_bias_from(
+        trial, bias, filter, [None], free=free, compare=compare, levels=levels, report=report
+    )
+    return fitted
+
+
+def fit_bias_from(
+    trial: Trial,
+    bias: CombinedBias,
+    filter: Filter,
+    starts: Sequence[Float[np.ndarray, " numbers"] | None],
+    *,
+    free: Sequence[str] | None = None,
+    compare: Compare = HardCompare(),
+    levels: Sequence[float] = LEVELS,
+    report: Report = lambda text: None,
+) -> list[BiasFit]:
+    """Fit as ``fit_bias`` does, from each of several starts; compiled once.
+
+    Args:
+        trial: As there, as all that is not here.
+        bias: As there.
+        filter: As there.
+        starts: In steps of the ``BiasSpace``; None for its own start.
+        free: As there.
+        compare: As there.
+        levels: As there.
+        report: As there.
+    """
     space, clock = BiasSpace.of(bias, filter, trial, free, compare=compare), Clock()
-    start = np.asarray(space.start)
-    softnesses = jnp.asarray(levels if space.softens else levels[:1], start.dtype)
+    softnesses = jnp.asarray(levels if space.softens else levels[:1], space.start.dtype)
     # As many steps in all where there is one level.
     most = _STEPS_PER_LEVEL * (1 if space.softens else len(LEVELS))
     solve = clock.compiled(_solve, space.start, space, trial, softnesses[0], most)
     search = Search(space, trial, clock, batch=_WAY)
-    best, score = start, search(start[None]).score(0)
-    vector, solved = space.start, []
-    for softness in softnesses:
-        with clock.running():
-            solution = jax.block_until_ready(solve(vector, space, trial, softness, most))
-        vector = solution.value
-        way = start + np.linspace(0, 1, _WAY + 1)[1:, None] * (np.asarray(vector) - start)
-        tried = search(way)
-        if tried.score(tried.best) < score:
-            best, score = way[tried.best], tried.score(tried.best)
-        result = _result(solution, most)
-        steps = int(solution.stats["num_steps"])
-        end = Level(float(softness), space.values(vector), float(tried.errors[-1]), steps, result)
-        solved.append(end)
-        report(f"softness {end.softness:.2g}: error {end.error:.3%}, {steps} steps")
-    point = jnp.asarray(best, start.dtype)
-    return BiasFit(
-        techniques=space.techniques(point),
-        values=space.values(point),
-        units=dict(zip(space.names, space.units, strict=True)),
-        error=score[0],
-        levels=tuple(solved),
-        evaluations=search.evaluations + sum(level.steps for level in solved),
-        seconds=clock.seconds,
-        compile_seconds=clock.compile_seconds,
-        untold=untold(point, space, trial, softnesses[0]),
-    )
+    fits = []
+    for start in starts:
+        before = clock.seconds, search.evaluations
+        vector = space.start if start is None else jnp.asarray(start, space.start.dtype)
+        start = np.asarray(vector)
+        best, score = start, search(start[None]).score(0)
+        solved = []
+        for softness in softnesses:
+            with clock.running():
+                solution = jax.block_until_ready(solve(vector, space, trial, softness, most))
+            vector = solution.value
+            way = start + np.linspace(0, 1, _WAY + 1)[1:, None] * (np.asarray(vector) - start)
+            tried = search(way)
+            if tried.score(tried.best) < score:
+                best, score = way[tried.best], tried.score(tried.best)
+            result = _result(solution, most)
+            steps, error = int(solution.stats["num_steps"]), float(tried.errors[-1])
+            end = Level(float(softness), space.values(vector), error, steps, result)
+            solved.append(end)
+            report(f"softness {end.softness:.2g}: error {end.error:.3%}, {steps} steps")
+        point = jnp.asarray(best, space.start.dtype)
+        fits.append(
+            BiasFit(
+                techniques=space.techniques(point),
+                values=space.values(point),
+                units=dict(zip(space.names, space.units, strict=True)),
+                error=score[0],
+                levels=tuple(solved),
+                evaluations=search.evaluations - before[1] + sum(level.steps for level in solved),
+                seconds=clock.seconds - before[0],
+                compile_seconds=clock.compile_seconds,
+                untold=untold(point, space, trial, softnesses[0]),
+            )
+        )
+    return fits
 
 
 def _result(solution: optx.Solution, most: int) -> str:

@@ -1,8 +1,8 @@
 """The command ``frontier``: error against time of every shadow technique, on scenes."""
 
 import json
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,16 +12,21 @@ import pyarrow.parquet as pq
 import tyro
 
 from ..checks import check_folder, make_folder
-from ..console import say, say_table, stage
+from ..console import say, say_notes, say_table, stage
 from ..files.images import atomic_path
 from ..provenance import commit, device, versions
+from ..scenes import load_scene
 from .chart import ERRORS, front, save_chart
-from .measure import Programs, accuracy, timing
-from .methods import Method, methods
+from .cluster import connect, measure_on
+from .errors import FIGURES
+from .methods import methods
+from .page import save_page
+from .peers import PEERS, absent
+from .run import ACCURACY, TIMING, Cell, Contender, measure_here, run
+from .shading_method import SHADING_METHODS
 from .store import Key, Store
-from .view import View, load_view
 
-SCENES = ("default", "sphere", "stacked", "thin-box", "spot", "room", "soft-lamp")
+SCENES = ("default", "bumpy", "stacked", "thin-box", "spot", "room", "soft-lamp")
 _QUICK_SCENES = ("default", "soft-lamp")
 
 
@@ -48,84 +53,101 @@ def frontier(
     image_size: Annotated[
         int, tyro.conf.arg(metavar="N", help="Pixels on each side of the image.")
     ] = 512,
-    runs: Annotated[int, tyro.conf.arg(help="Warm runs of each program, twice.")] = 5,
+    runs: Annotated[
+        int, tyro.conf.arg(help="Warm runs of each program at least, twice.")
+    ] = 5,
+    scheduler: Annotated[
+        str | None,
+        tyro.conf.arg(metavar="ADDRESS", help="Dask scheduler whose workers measure, as in "
+                      "tcp://host:8786.", help_behavior_hint="(default: this process measures)"),
+    ] = None,
 ) -> None:  # fmt: skip
     """Chart error against time for every shadow filter, number of taps and size of map.
 
     For each: the light's pass, the filter's preparation and the image, timed warm; and the
     error against ray-traced truth at the best of the biases that suit the filter. Timings
     want an idle machine. Writes frontier.parquet, a row for each scene and method,
-    frontier.json, and a chart, frontier.png and frontier.pdf.
+    frontier.json, a chart, frontier.png and frontier.pdf, and frontier.html, a chart to explore.
     """
     check_folder(out)
     if image_size < 1 or runs < 1:
         raise ValueError("frontier: expected --image-size and --runs of at least 1")
-    chosen = methods(techniques, quick=quick)
     names = scenes or (_QUICK_SCENES if quick else SCENES)
+    for name in names:
+        load_scene(name)  # so that a wrong name is told now, not after an hour
+    chosen = contenders(techniques, quick=quick)
+    cells = [
+        Cell(what, scene, contender, image_size, runs)
+        for scene, contender, what in product(names, chosen, (ACCURACY, TIMING))
+    ]
+    measured = measure_here
+    if scheduler is not None:
+        measured = partial(measure_on, connect(scheduler))
     make_folder(out)
     store = Store(out)
     with stage("measuring") as tell:
-        run(names, chosen, store, image_size=image_size, runs=runs, tell=tell)
+        run(cells, store, measured=measured, tell=tell)
     rows = list(table(names, chosen, store, image_size))
-    write(rows, out)
+    write(rows, out, pictures=_pictures(rows, store))
     for scene in names:
         _print(scene, [row for row in rows if row["scene"] == scene])
-    say(f"tables and charts: {out} (start with frontier.png)")
+    say(f"tables and charts: {out} (start with frontier.html)")
 
 
-def run(
-    scenes: Sequence[str],
-    chosen: Sequence[Method],
-    store: Store,
-    *,
-    image_size: int,
-    runs: int,
-    tell: Any = lambda text: None,
-) -> None:
-    """Measure what the store does not hold, one after another."""
-    programs = Programs()
-    todo = [
-        (scene, method, kind)
-        for scene, method, kind in product(scenes, chosen, ("accuracy", "timing"))
-        if store.get(Key(kind, scene, method.name, image_size)) is None
-    ]
-    view: tuple[str, View] | None = None
-    start = time.perf_counter()
-    for done, (scene, method, kind) in enumerate(todo):
-        spent = time.perf_counter() - start
-        left = f", {spent / done * (len(todo) - done):.0f} s left" if done > 4 else ""
-        tell(f"{done} of {len(todo)}{left}: {scene}, {method.name}")
-        if view is None or view[0] != scene:
-            view = scene, load_view(scene, image_size)
-        if kind == "accuracy":
-            figures = accuracy(view[1], method, programs)
-        else:
-            figures = timing(view[1], method, programs, runs=runs)
-        store.put(Key(kind, scene, method.name, image_size), figures)
+def contenders(techniques: Sequence[str] = (), *, quick: bool = False) -> tuple[Contender, ...]:
+    """Return all that is compared, or only filters of some names.
+
+    Peers that cannot run here are named to the user.
+    """
+    filters = methods(techniques, quick=quick)
+    if techniques:
+        return filters
+    missing = absent()
+    say_notes(f"{name} left out: {reason}" for name, reason in missing.items())
+    peers = [peer for peer in PEERS if peer.technique not in missing]
+    return (*filters, *SHADING_METHODS, *peers)
 
 
 def table(
-    scenes: Sequence[str], chosen: Sequence[Method], store: Store, image_size: int
+    scenes: Sequence[str], chosen: Sequence[Contender], store: Store, image_size: int
 ) -> Iterator[dict[str, Any]]:
-    """Return a flat row for each scene and method."""
-    for scene, method in product(scenes, chosen):
-        keys = [Key(kind, scene, method.name, image_size) for kind in ("accuracy", "timing")]
+    """Yield a flat row for each scene and contender that is for it."""
+    for scene, contender in product(scenes, chosen):
+        keys = [Key(what, scene, contender.name, image_size) for what in (ACCURACY, TIMING)]
         found, cost = (store.get(key) or {} for key in keys)
+        if not cost:
+            continue
         row = {
-            "scene": scene, "technique": method.technique, "setting": method.label,
-            "map_size": method.map_size, "image_size": image_size, **found,
-            "total_ms": cost["total_ms"], "kept_bytes": cost["kept_bytes"],
-            "stable": cost["stable"],
+            "scene": scene, "kind": contender.kind, "name": contender.name,
+            "technique": contender.technique, "setting": contender.label,
+            "map_size": contender.map_size, "image_size": image_size,
+            **dict.fromkeys(FIGURES), **found,
+            "total_ms": cost["total_ms"][1], "total_ms_low": cost["total_ms"][0],
+            "total_ms_high": cost["total_ms"][2],
+            "kept_bytes": cost["kept_bytes"], "stable": cost["stable"],
         }  # fmt: skip
         for part in ("draw", "prepare", "image", "gradient"):
-            quartiles = zip(("low", "median", "high"), cost[part]["ms"], strict=True)
+            of_part = cost[part] or {"ms": [None] * 3, "compile_s": None, "temporary_bytes": None}
+            quartiles = zip(("low", "median", "high"), of_part["ms"], strict=True)
             row |= {f"{part}_ms_{name}": value for name, value in quartiles}
-            row |= {f"{part}_{name}": cost[part][name] for name in ("compile_s", "temporary_bytes")}
+            row |= {f"{part}_{name}": of_part[name] for name in ("compile_s", "temporary_bytes")}
         yield row
 
 
-def write(rows: Sequence[dict[str, Any]], out: Path) -> None:
-    """Write the table, its JSON with what made it, and the chart."""
+def _pictures(rows: Sequence[dict[str, Any]], store: Store) -> dict[tuple[str, str], bytes]:
+    found = {}
+    for row in rows:
+        key = Key(ACCURACY, row["scene"], row["name"], row["image_size"])
+        picture = store.picture(key)
+        if picture is not None:
+            found[row["scene"], row["name"]] = picture
+    return found
+
+
+def write(
+    rows: Sequence[dict[str, Any]], out: Path, *, pictures: Mapping[tuple[str, str], bytes]
+) -> None:
+    """Write the table, its JSON with what made it, the chart and the page."""
     made_with = {"versions": versions(), "device": device(), "commit": commit()}
     with atomic_path(out / "frontier.parquet") as temporary:
         pq.write_table(pa.Table.from_pylist(list(rows)), temporary)
@@ -133,20 +155,23 @@ def write(rows: Sequence[dict[str, Any]], out: Path) -> None:
         temporary.write_text(json.dumps({"rows": list(rows)} | made_with, indent=1) + "\n", "utf-8")
     for suffix in (".png", ".pdf"):
         save_chart(rows, out / f"frontier{suffix}")
+    save_page(rows, pictures, out / "frontier.html", made_with=made_with)
 
 
 def _print(scene: str, rows: Sequence[dict[str, Any]]) -> None:
     """Print the methods that no other beats in both time and error."""
-    best = sorted(front(rows, "rmse"), key=lambda row: row["total_ms"])
-    say_table(
-        f"{scene}: none is both faster and closer to truth",
-        ["method", "map", "ms", *ERRORS, "bias", "steady"],
-        [
-            [
-                row["setting"], str(row["map_size"]), f"{row['total_ms']:.1f}",
-                *(f"{row[error]:.4f}" for error in ERRORS),
-                row["bias"], "yes" if row["stable"] else "no",
-            ]
-            for row in best
-        ],
-    )  # fmt: skip
+    for title, kinds in ((scene, ("shadow", "peer")), (f"{scene}, its normal map", ("shading",))):
+        best = front([row for row in rows if row["kind"] in kinds], "rmse")
+        if best:
+            say_table(
+                f"{title}: none is both faster and closer to truth",
+                ["method", "map", "ms", *ERRORS, "bias", "steady"],
+                [
+                    [
+                        row["setting"], str(row["map_size"] or ""), f"{row['total_ms']:.1f}",
+                        *("" if row[error] is None else f"{row[error]:.4f}" for error in ERRORS),
+                        row["bias"] or "", "yes" if row["stable"] else "no",
+                    ]
+                    for row in best
+                ],
+            )  # fmt: skip

@@ -1,11 +1,11 @@
 """What the frontier compares: every filter with its numbers of taps, at every size of map."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 from shadows.filters import Filter
 
-from ..options import hint, parse_technique, techniques
+from ..options import hint, techniques
+from .shadow_method import Method
 
 # The words of ``--filter`` for filters of several sizes; any other filter counts once.
 _SIZES = {
@@ -18,31 +18,6 @@ _SIZES = {
 }
 MAP_SIZES = (256, 512, 1024, 2048)
 QUICK_MAP_SIZES = (256, 1024)
-
-
-class Method(NamedTuple):
-    """A filter with its numbers, and the map that it asks.
-
-    Attributes:
-        technique: Name of the filter.
-        label: Name with its size, ``pcf 5x5``.
-        words: What ``--filter`` takes.
-        map_size: Texels on each side.
-    """
-
-    technique: str
-    label: str
-    words: tuple[str, ...]
-    map_size: int
-
-    @property
-    def name(self) -> str:
-        """As in tables, ``pcf 5x5 @ 512``; tells methods apart."""
-        return f"{self.label} @ {self.map_size}"
-
-    def filter(self) -> Filter:
-        """Make the filter."""
-        return parse_technique(Filter, self.words, option="--filter")
 
 
 def methods(names: Sequence[str] = (), *, quick: bool = False) -> tuple[Method, ...]:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from ..console import say_notes
 from ..files.images import atomic_path
 
-FORMAT = 1  # of the files; another means a folder that this version cannot go on with
+FORMAT = 2  # of the files; another means a folder that this version cannot go on with
 
 
 class Key(NamedTuple):
@@ -66,11 +66,19 @@ class Store:
         say_notes([f"{path}: damaged; set aside as {aside.name} and measured again"])
         return None
 
-    def put(self, key: Key, figures: Mapping[str, Any]) -> None:
-        """Keep a measurement."""
+    def put(self, key: Key, figures: Mapping[str, Any], picture: bytes | None = None) -> None:
+        """Keep a measurement, and the picture that was made with it."""
         path = self._path(key)
         path.parent.mkdir(parents=True, exist_ok=True)
+        if picture is not None:
+            with atomic_path(path.with_suffix(".webp")) as temporary:
+                temporary.write_bytes(picture)
         _write(path, {"key": list(key), "figures": dict(figures)})
+
+    def picture(self, key: Key) -> bytes | None:
+        """Return the picture of a measurement, or None."""
+        path = self._path(key).with_suffix(".webp")
+        return path.read_bytes() if path.exists() else None
 
     def _path(self, key: Key) -> Path:
         plain = re.sub(r"[^a-z0-9]+", "-", " ".join(map(str, key[1:])).lower()).strip("-")

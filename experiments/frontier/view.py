@@ -21,6 +21,10 @@ from ..scenes import load_scene
 from ..technique_words import choose_layout
 from ..truth.area import seen_share
 from ..truth.rays import Occluders
+from .light_motion import Patterns, patterns, truth_slopes
+from .lit_map import Lit, light_finely
+
+_SPARSE = 4  # every so many pixels each way are asked how an area light's share changes
 
 
 class View(NamedTuple):
@@ -35,6 +39,10 @@ class View(NamedTuple):
         facing: Pixels of surfaces that face the light.
         share: Of the light that is seen from each pixel; 0 or 1 but for area lights.
         color: The image under that share, linear RGB.
+        center: Of what is seen, about which the light moves for ``slopes``.
+        patterns: Weights of means over the image, from ``light_motion``.
+        slopes: How these means of the share change as the light moves.
+        lit: Truth of the normal map's color; None where there is no normal map.
     """
 
     name: str
@@ -45,6 +53,10 @@ class View(NamedTuple):
     facing: Bool[np.ndarray, "height width"]
     share: Float[np.ndarray, "height width"]
     color: Float[np.ndarray, "height width 3"]
+    center: Float[np.ndarray, "3"]
+    patterns: Patterns
+    slopes: Float[np.ndarray, "2 patterns"]
+    lit: Lit | None
 
     @property
     def soft(self) -> bool:
@@ -65,14 +77,34 @@ def load_view(name: str, image_size: int) -> View:
     arrays = jax.tree.map(jnp.asarray, (scene.mesh, scene.camera))
     size = (image_size, image_size)
     surface = jax.jit(lambda mesh, camera: render_surface(mesh, camera, image_size=size))(*arrays)
-    position, normal = np.asarray(surface.position), np.asarray(surface.face_normal)
-    places = position, normal, np.asarray(surface.face_ids)
     occluders = Occluders(scene.mesh.positions, scene.mesh.faces)
-    seen = seen_share(*places, light, occluders)
-    towards = np.asarray(dot(surface.face_normal, light.to_light(surface.position)))
-    facing = np.asarray(surface.covered) & (towards > 0)
-    share = np.where(facing, seen, 0.0)
+    facing, share = _seen(surface, light, occluders)
     light = jax.tree.map(jnp.asarray, light)
     color = jax.jit(lambda share: shade(surface, (light,), (share,)))(jnp.asarray(share))
+    center = np.asarray(surface.position)[np.asarray(surface.covered)].mean(axis=0)
+    weights = patterns(surface, light)
+    sparse = _SPARSE if isinstance(light, AreaLight) else 1
+
+    def seen(light: Light) -> Float[np.ndarray, "height width"]:
+        found = np.zeros_like(share)
+        some = np.s_[::sparse, ::sparse]
+        found[some] = _seen(jax.tree.map(lambda a: a[some], surface), light, occluders)[1]
+        return found * sparse**2
+
+    slopes = truth_slopes(seen, light, weights, center)
     moved = scene._replace(mesh=arrays[0], camera=arrays[1])
-    return View(scene.name, moved, light, layout, surface, facing, share, np.asarray(color))
+    return View(
+        scene.name, moved, light, layout, surface, facing, share, np.asarray(color),
+        center, weights, slopes, light_finely(scene, light, size),
+    )  # fmt: skip
+
+
+def _seen(
+    surface: Surface, light: Light, occluders: Occluders
+) -> tuple[Bool[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
+    """Return which pixels face a light, and the share of it that they see."""
+    position, normal, ids = surface.position, surface.face_normal, surface.face_ids
+    places = np.asarray(position), np.asarray(normal), np.asarray(ids)
+    towards = np.asarray(dot(normal, light.to_light(position)))
+    facing = np.asarray(surface.covered) & (towards > 0)
+    return facing, np.where(facing, seen_share(*places, light, occluders), 0.0)

@@ -1,0 +1,264 @@
+"""A shadow filter with its numbers and its size of map: how wrong it is, and what it costs.
+
+Three programs make a picture: the light's pass, what the filter makes of the map, and the
+image that asks it. A fourth is the derivative in a bias.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from shadows.bias import Bias, CombinedBias, ConstantBias, SlopeBias
+from shadows.compare import Compare, HardCompare, SoftCompare
+from shadows.filters import Filter
+from shadows.layouts import Layout
+from shadows.lights import Light
+from shadows.plane_bias import AdaptiveBias
+from shadows.render import shade, surface_visibility
+from shadows.shadow_map import ShadowMap, render_shadow_map
+from shadows.surface import Surface
+from shadows.transforms import Camera
+from tangentspace.mesh import Mesh
+
+from ..metrics import soft_shadow_errors
+from ..options import parse_technique
+from .errors import errors
+from .light_motion import move_light, slope_error
+from .pictures import picture
+from .programs import Programs, Timed, time_stages
+from .view import View
+
+Shared = tuple[Light, Surface, ShadowMap, Any]
+_FACTORS, _LENGTHS = (0.5, 0.75, 1.0, 1.5), (0.0, 0.3, 1.0, 2.0)  # reaches, texels
+_TOLERANCES = (0.0, 0.1, 0.3, 1.0, 3.0)  # texels
+_SOFT = SoftCompare(0.5)  # of derivatives
+
+
+class Method(NamedTuple):
+    """A filter with its numbers, and the map that it asks.
+
+    Attributes:
+        technique: Name of the filter.
+        label: Name with its size, ``pcf 5x5``.
+        words: What ``--filter`` takes.
+        map_size: Texels on each side.
+    """
+
+    technique: str
+    label: str
+    words: tuple[str, ...]
+    map_size: int
+
+    @property
+    def kind(self) -> str:
+        """What it is among others in the table."""
+        return "shadow"
+
+    @property
+    def name(self) -> str:
+        """As in tables, ``pcf 5x5 @ 512``; tells methods apart."""
+        return f"{self.label} @ {self.map_size}"
+
+    def filter(self) -> Filter:
+        """Make the filter."""
+        return parse_technique(Filter, self.words, option="--filter")
+
+    def applies(self, view: View) -> bool:
+        """Whether it is for a view: for all."""
+        return True
+
+    def accuracy(self, view: View, programs: Programs) -> tuple[dict[str, Any], bytes]:
+        """Return its figures, and its picture."""
+        return accuracy(view, self, programs)
+
+    def timing(self, view: View, programs: Programs, *, runs: int) -> dict[str, Any]:
+        """Return its cost."""
+        return timing(view, self, programs, runs=runs)
+
+
+class Passes:
+    """A method on a view: its programs and their arguments."""
+
+    def __init__(self, view: View, method: Method, programs: Programs) -> None:
+        """Draw the map and prepare it."""
+        self._view, self._method, self._programs = view, method, programs
+        self.filter = method.filter().for_light(view.light)
+        scene, reach = view.scene, jnp.float32(self.filter.reach())
+        self._drawing = (view.layout, scene.mesh, scene.camera, view.light, reach)
+        draw = partial(_draw, method.map_size)
+        self._draw = programs.get(f"draw {method.map_size}", draw, *self._drawing)
+        self._map = self._draw()
+        self._prepare = programs.get(f"prepare {method.name}", self.filter.prepare, self._map)
+        self._prepared = self._prepare()
+
+    def image(self, bias: Bias) -> Timed:
+        """Return the program that asks the map: visibility and color."""
+        name = f"image {self._method.name}"
+        return self._programs.get(name, _image, bias, self.filter, self._shared())
+
+    def gradient(self, bias: Bias) -> Timed:
+        """Return the program of a loss against truth and its derivative in a bias."""
+        name, share = f"gradient {self._method.name}", np.asarray(self._view.share, np.float32)
+        return self._programs.get(name, _loss_gradient, bias, self.filter, share, self._shared())
+
+    def changes(self, bias: Bias) -> Float[np.ndarray, "2 height width"]:
+        """Return the derivatives of the visibility as the light moves, at a soft comparison."""
+        center, changes = self._view.center, []
+        draw = partial(_draw_change, self._method.map_size)
+        for step in np.eye(2, dtype=np.float32):
+            drawn = self._programs.get(
+                f"draw change {self._method.map_size}", draw, step, center, *self._drawing
+            )
+            change = self._programs.get(
+                f"change {self._method.name}", _change,
+                step, center, bias, self.filter, self._view.light, self._view.surface, *drawn(),
+            )  # fmt: skip
+            changes.append(np.asarray(change()))
+        return np.stack(changes)
+
+    @property
+    def stages(self) -> dict[str, Timed]:
+        """The programs before the image."""
+        return {"draw": self._draw, "prepare": self._prepare}
+
+    @property
+    def kept_bytes(self) -> int:
+        """What lies in memory between images."""
+        return sum(leaf.nbytes for leaf in jax.tree.leaves((self._map, self._prepared)))
+
+    def _shared(self) -> Shared:
+        return self._view.light, self._view.surface, self._map, self._prepared
+
+
+def accuracy(view: View, method: Method, programs: Programs) -> tuple[dict[str, Any], bytes]:
+    """Return how wrong a method is, at the best of the biases that suit its filter.
+
+    Returns:
+        The figures of ``errors`` for the bias of least ``rmse``; that ``bias``; and
+        ``gradient_error``, how far derivatives of the visibility in the light's place are
+        from those of truth, as ``slope_error`` says. And its picture.
+    """
+    passes = Passes(view, method, programs)
+    covered = np.asarray(view.surface.covered)
+    best: tuple[float, Bias, np.ndarray, np.ndarray] | None = None
+    for bias in biases(passes.filter):
+        visibility, color = map(np.asarray, passes.image(bias)())
+        rmse = soft_shadow_errors(visibility, view.share, covered).rmse
+        if best is None or rmse < best[0]:
+            best = rmse, bias, visibility, color
+    assert best is not None
+    _, bias, visibility, color = best
+    passes.gradient(bias)  # compiled for ``timing``, which is to be alone
+    figures = errors(view, visibility, color) | {
+        "gradient_error": slope_error(passes.changes(bias), view.patterns, view.slopes),
+        "bias": _said(bias),
+    }
+    return figures, picture(view, visibility, color)
+
+
+def timing(view: View, method: Method, programs: Programs, *, runs: int) -> dict[str, Any]:
+    """Return what a method costs, compiled and warm: ``time_stages``, and ``kept_bytes``.
+
+    Args:
+        view: Where.
+        method: What.
+        programs: Compiled so far.
+        runs: Of each program, as ``time_stages`` takes them.
+    """
+    passes = Passes(view, method, programs)
+    bias = biases(passes.filter)[0]
+    stages = passes.stages | {"image": passes.image(bias), "gradient": passes.gradient(bias)}
+    cost = time_stages(stages, total=("draw", "prepare", "image"), runs=runs)
+    return cost | {"kept_bytes": passes.kept_bytes}
+
+
+def biases(filter: Filter) -> list[Bias]:
+    """Return the biases that are tried, the default one's like first."""
+    if not filter.needs_bias:
+        return [CombinedBias()]
+    if filter.compares and filter.wide:
+        return [AdaptiveBias(t) for t in sorted(_TOLERANCES, key=lambda t: abs(t - 0.3))]
+    pairs = [(factor, length) for factor in _FACTORS for length in _LENGTHS]
+    return [
+        CombinedBias((SlopeBias(factor, unit="reach"), ConstantBias(length, unit="texel")))
+        for factor, length in sorted(pairs, key=lambda pair: (abs(pair[0] - 1), pair[1]))
+    ]
+
+
+def _said(bias: Bias) -> str:
+    terms = bias.terms if isinstance(bias, CombinedBias) else (bias,)
+    said = [
+        f"{type(term).__name__} {float(jax.tree.leaves(term)[0]):g} {getattr(term, 'unit', '')}"
+        for term in terms
+    ]
+    return " and ".join(said) or "none"
+
+
+def _draw(
+    map_size: int, layout: Layout, mesh: Mesh, camera: Camera, light: Light, reach: Array
+) -> ShadowMap:
+    """Return the light's map; the pass is the same for every filter."""
+    matrices = layout.matrices(
+        light, mesh.positions, camera, aspect=1.0, map_size=map_size, reach=reach
+    )
+    return render_shadow_map(mesh.positions, mesh.faces, matrices, map_size=map_size)
+
+
+def _visibility(
+    bias: Bias, filter: Filter, compare: Compare, shared: Shared
+) -> Float[Array, "height width"]:
+    light, surface, shadow_map, prepared = shared
+    return surface_visibility(
+        surface, light, shadow_map, bias=bias, filter=filter, compare=compare, prepared=prepared
+    )
+
+
+def _image(
+    bias: Bias, filter: Filter, shared: Shared
+) -> tuple[Float[Array, "height width"], Float[Array, "height width 3"]]:
+    light, surface, _, _ = shared
+    seen = _visibility(bias, filter, HardCompare(), shared)
+    return seen, shade(surface, (light,), (seen,))
+
+
+def _loss_gradient(
+    bias: Bias, filter: Filter, share: Float[Array, "height width"], shared: Shared
+) -> tuple[Array, Array]:
+    """Return a loss against truth, and its derivative in a constant bias beside the given one."""
+
+    def loss(length: Array) -> Array:
+        both = CombinedBias((bias, ConstantBias(length)))
+        return jnp.mean((_visibility(both, filter, _SOFT, shared) - share) ** 2)
+
+    return jax.value_and_grad(loss)(jnp.zeros((), share.dtype))
+
+
+def _draw_change(
+    map_size: int, step: Array, center: Array,
+    layout: Layout, mesh: Mesh, camera: Camera, light: Light, reach: Array,
+) -> tuple[ShadowMap, ShadowMap]:  # fmt: skip
+    """Return the light's map, and how it changes as the light begins to move."""
+
+    def draw(angles: Array) -> ShadowMap:
+        return _draw(map_size, layout, mesh, camera, move_light(light, angles, center), reach)
+
+    return jax.jvp(draw, (jnp.zeros_like(step),), (step,))
+
+
+def _change(
+    step: Array, center: Array, bias: Bias, filter: Filter, light: Light, surface: Surface,
+    shadow_map: ShadowMap, change: ShadowMap,
+) -> Float[Array, "height width"]:  # fmt: skip
+    """Return the derivative of the visibility as the light begins to move, and its map."""
+
+    def seen(angles: Array, shadow_map: ShadowMap) -> Array:
+        moved = move_light(light, angles, center)
+        prepared = filter.prepare(shadow_map)
+        return _visibility(bias, filter, _SOFT, (moved, surface, shadow_map, prepared))
+
+    _, tangent = jax.jvp(seen, (jnp.zeros_like(step), shadow_map), (step, change))
+    return tangent
