@@ -16,7 +16,10 @@ _WITH_WORDS = ("--bias", "--filter", "--compare", "--shading", "--layout")
 
 
 def main() -> int:
-    """Run a command; errors are one line and exit code 2, an interrupt is 130."""
+    """Run a command; errors are one line and exit code 2, an interrupt is 130.
+
+    Code 3 says that no model meets the tolerance of ``simplest``.
+    """
     try:
         return _run(sys.argv[1:])
     except KeyboardInterrupt:
@@ -37,6 +40,9 @@ def _run(arguments: Sequence[str]) -> int:
     from .frontier.command import frontier
     from .normal_map_fits.fit_normal_map_command import fit as fit_normal_map
     from .rendering.render_command import render
+    from .simplest.command import simplest
+    from .simplest.search import OutOfReach
+    from .stability.command import stability
 
     commands = {
         "render": render,
@@ -45,11 +51,16 @@ def _run(arguments: Sequence[str]) -> int:
         "bake-normals": bake,
         "bake-light": bake_light,
         "frontier": frontier,
+        "stability": stability,
+        "simplest": simplest,
     }
     try:
         _parse(arguments, commands)()
     except BrokenPipeError:
         raise
+    except OutOfReach as error:
+        say_error(str(error))
+        return 3
     except (ValueError, OSError) as error:
         say_error(" ".join(str(error).split()))
         return 2

@@ -17,6 +17,22 @@ from experiments.scene import Scene
 from experiments.scenes import EMBEDDED, load_scene
 from experiments.scenes.bias_failures import contact_plate, contact_wall, tilted_plane, turned_plane
 from experiments.scenes.failure_scenes import FAILURE_SCENES, FAILURES
+from experiments.stability import frames
+from experiments.stability.frames import LARGEST
+from experiments.stability.views import (
+    FACES,
+    IMAGE,
+    VERTICES,
+    lightings,
+    on_device,
+    padded,
+    precision,
+    quick,
+    truth,
+    view,
+    view_of,
+    visibility,
+)
 from experiments.technique_words import choose_layout
 from shadows import (
     AdaptiveBias,
@@ -47,33 +63,10 @@ from shadows import (
     volume_visibility,
 )
 from tangentspace import (
-    corner_groups,
-    corner_tangents,
     face_normals,
-    gram_schmidt,
-    group_tangents,
-    perturb_normal,
     split_mirrored,
-    triangle_frames,
-    vertex_frames,
-    vertex_normals,
 )
 from tangentspace._math import dot
-
-from .failure_views import (
-    FACES,
-    IMAGE,
-    VERTICES,
-    lightings,
-    on_device,
-    padded,
-    precision,
-    quick,
-    truth,
-    view,
-    view_of,
-    visibility,
-)
 
 SCENES = {name: make() for name, make in FAILURE_SCENES.items()}
 SHADOWED = [name for name, failure in FAILURES.items() if failure.row <= 30]
@@ -275,56 +268,13 @@ MAPPED = {
     for name, scene in SCENES.items()
     if any(look.normal_texture is not None for look in scene.materials)
 }
-LARGEST = 1250, 2250  # vertices and faces
-
-
-@quick
-def framed(positions, normals, uvs, groups, bumps):
-    """Return what frames there are, and the gradient of a sum over all their numbers."""
-
-    def total(positions, normals, uvs):
-        frames = vertex_frames(positions, normals, uvs, groups.faces)
-        corners = group_tangents(positions, normals, uvs, groups)
-        made = {
-            "faces": face_normals(positions, groups.faces),
-            "vertices": vertex_normals(positions, groups.faces),
-            "triangles": triangle_frames(positions, uvs, groups.faces),
-            "frames": frames,
-            "orthonormal": gram_schmidt(frames.tangent, frames.bitangent, normals),
-            "corners": corners,
-            "pixels": perturb_normal(bumps, corners, normals[groups.faces]),
-        }
-        numbers = jax.tree.leaves(eqx.filter(made, eqx.is_inexact_array))
-        return sum(jnp.sum(jnp.sin(leaf)) for leaf in numbers), made
-
-    return jax.value_and_grad(total, argnums=(0, 1, 2), has_aux=True)(positions, normals, uvs)
-
-
-def padded_groups(mesh):
-    """Return a mesh's groups with more sums, which nothing reads; the default stays the last."""
-    groups = corner_groups(mesh.positions, mesh.normals, mesh.uvs, mesh.faces)
-    count, default = groups.faces.size, len(groups.handedness) - 1
-    grown = lambda values, fill: np.concatenate(
-        [values, np.full(count - len(values), fill, np.int32)]
-    )
-    return groups._replace(
-        members=grown(groups.members, 0),
-        sums=grown(groups.sums, count - 1),
-        handedness=grown(groups.handedness, groups.handedness[-1]),
-        corner_sums=np.where(groups.corner_sums == default, count - 1, groups.corner_sums),
-    )
 
 
 @functools.cache
 def frames_of(name):
     """Return a scene's padded mesh, its corners' tangents, all frames, and their derivatives."""
-    mesh = padded(SCENES[name].mesh, *LARGEST)
-    groups = padded_groups(mesh)
-    bumps = np.broadcast_to(np.array([0.3, -0.2, 0.9]), (*groups.faces.shape, 3))
     with precision(np.float32):
-        numbers = on_device((mesh.positions, mesh.normals, mesh.uvs, bumps), np.float32)
-        (_, made), slopes = framed(*numbers[:3], groups, numbers[3])
-    return mesh, corner_tangents(mesh), made, slopes
+        return frames.frames_of(SCENES[name].mesh)
 
 
 @pytest.mark.parametrize("name", MAPPED)

@@ -142,7 +142,7 @@ def edge_on_triangle() -> Scene:
 def bent_normals() -> Scene:
     """Row 30: rods over a ball of few faces: offset along its smooth normals, shadow is lost."""
     ball = placed(icosphere(0.7, subdivisions=1), (0.0, 0.8, 0.0))
-    rods = [placed(box((0.015, 0.015, 0.9)), (x, 1.7, 0.0)) for x in (-0.3, 0.0, 0.3, 0.6)]
+    rods = [placed(box((0.05, 0.05, 0.9)), (x, 1.7, 0.0)) for x in (-0.3, 0.0, 0.3, 0.6)]
     parts = [plane(2.0), ball, *rods]
     return staged("bent-normals", parts, eye=(1.2, 2.0, 3.2), light=sun(60.0, 70.0))
 

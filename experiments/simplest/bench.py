@@ -1,0 +1,177 @@
+"""Measurements of models: the picture, how wrong it is, and the time that each stage takes.
+
+The time of a model is that of its light pass, of what the filter makes of the map, of the
+lookup and of the shading with its textures, each compiled and warm, over several runs. A
+stage that models share is timed once, so that models differ only where they are different.
+The eye's pass is the same for all, and not counted.
+"""
+
+import functools
+import time
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from shadows.bias import Bias
+from shadows.compare import HardCompare
+from shadows.filters import Filter
+from shadows.layouts import Layout
+from shadows.lights import Light
+from shadows.render import surface_visibility
+from shadows.shadow_map import ShadowMap, render_shadow_map
+from shadows.surface import Surface
+from shadows.transforms import Camera
+from tangentspace.mesh import Mesh
+
+from ..frontier.programs import Programs, Timed
+from ..options import parse_technique
+from ..technique_words import parse_bias
+from .models import Model, bias_words, filters
+from .sight import Measure, Picture, Sight, shade_picture, shading_arguments, shown
+
+Stage = tuple[str, ...]  # its kind, and what tells it from others of its kind
+
+
+class Measured(NamedTuple):
+    """What was found of a model.
+
+    Attributes:
+        error: Distance of its picture from truth.
+        ms: Time of each of its stages.
+    """
+
+    error: float
+    ms: dict[Stage, float]
+
+    @property
+    def cost(self) -> float:
+        """Its time, ms."""
+        return sum(self.ms.values())
+
+
+def stages(model: Model) -> list[Stage]:
+    """Return the stages of a model; models with a stage in common share its time."""
+    shade = ("shade", model.look)
+    if not model.filter:
+        return [shade]
+    size = str(model.map_size)
+    return [
+        ("draw", size),
+        ("prepare", model.filter, size),
+        ("look up", model.filter, size, model.bias),
+        shade,
+    ]
+
+
+class Bench:
+    """Measures models on one scene; what was timed is kept."""
+
+    def __init__(
+        self, sight: Sight, slope: float, *, measure: Measure, runs: int, programs: Programs
+    ) -> None:
+        """Begin with nothing measured.
+
+        Args:
+            sight: The scene.
+            slope: Of the constant bias, see ``bias_words``.
+            measure: Of the error.
+            runs: Of each stage, at least.
+            programs: Compiled so far.
+        """
+        self.sight, self.slope = sight, slope
+        self._measure: Measure = measure
+        self._runs, self._programs = runs, programs
+        self._ms: dict[Stage, float] = {}
+
+    def measure(self, model: Model) -> Measured:
+        """Return a model's error and time."""
+        picture, timed = self._made(model)
+        for stage, programs in timed.items():
+            if stage not in self._ms:
+                self._ms[stage] = sum(_run(program, self._runs) for program in programs)
+        error = self.sight.error(picture, self._measure)
+        return Measured(error, {stage: self._ms[stage] for stage in timed})
+
+    def _made(self, model: Model) -> tuple[Picture, dict[Stage, list[Timed]]]:
+        """Return a model's picture, and for each stage its program for each light."""
+        timed: dict[Stage, list[Timed]] = {stage: [] for stage in stages(model)}
+        visibilities = []
+        for seen in self.sight.seen:
+            if model.filter:
+                visibilities.append(self._shadow(model, seen.light, timed))
+            else:
+                visibilities.append(jnp.asarray(seen.facing, jnp.float32))
+        arguments = (*shading_arguments(self.sight, model.look), tuple(visibilities))
+        shade = self._programs.get(f"simplest shade {model.look}", shade_picture, *arguments)
+        timed[("shade", model.look)] = [shade]
+        return shown(np.asarray(shade())), timed
+
+    def _shadow(self, model: Model, light: Light, timed: dict[Stage, list[Timed]]) -> Array:
+        """Return a light's visibility under a model, and note the programs that made it."""
+        draw_stage, prepare_stage, look_up_stage, _ = stages(model)
+        filter, bias = techniques(model, self.slope)
+        filter = filter.for_light(light)
+        scene = self.sight.scene
+        draw = self._programs.get(
+            f"simplest draw {model.map_size}",
+            partial(_draw, model.map_size),
+            self.sight.layout, scene.mesh, scene.camera, light, jnp.float32(filter.reach()),
+        )  # fmt: skip
+        shadow_map = draw()
+        name = f"{model.filter} {model.map_size}"
+        prepare = self._programs.get(f"simplest prepare {name}", _prepare, filter, shadow_map)
+        look_up = self._programs.get(
+            f"simplest look up {name}", _look_up, bias, filter, light, self.sight.surface,
+            shadow_map, prepare(),
+        )  # fmt: skip
+        for stage, program in (
+            (draw_stage, draw), (prepare_stage, prepare), (look_up_stage, look_up)
+        ):  # fmt: skip
+            timed[stage].append(program)
+        return look_up()
+
+
+def techniques(model: Model, slope: float) -> tuple[Filter, Bias]:
+    """Make a model's filter and bias."""
+    return _parsed(model.filter, model.bias, slope)
+
+
+@functools.lru_cache(256)
+def _parsed(filter_name: str, bias: str, slope: float) -> tuple[Filter, Bias]:
+    filter = parse_technique(Filter, filters()[filter_name].words, option="--filter")
+    return filter, parse_bias(bias_words(bias, slope), filter)
+
+
+def _draw(
+    map_size: int, layout: Layout, mesh: Mesh, camera: Camera, light: Light, reach: Array
+) -> ShadowMap:
+    matrices = layout.matrices(
+        light, mesh.positions, camera, aspect=1.0, map_size=map_size, reach=reach
+    )
+    return render_shadow_map(mesh.positions, mesh.faces, matrices, map_size=map_size)
+
+
+def _prepare(filter: Filter, shadow_map: ShadowMap) -> Any:
+    return filter.prepare(shadow_map)
+
+
+def _look_up(
+    bias: Bias, filter: Filter, light: Light, surface: Surface, shadow_map: ShadowMap, kept: Any
+) -> Float[Array, "height width"]:
+    return surface_visibility(
+        surface, light, shadow_map, bias=bias, filter=filter, compare=HardCompare(), prepared=kept
+    )
+
+
+def _run(program: Timed, runs: int) -> float:
+    """Return the time of a run in ms: the lower quartile, which other load disturbs less."""
+    program()
+    times = []
+    while len(times) < runs or (sum(times) < 0.02 and len(times) < 4 * runs):
+        start = time.perf_counter()
+        program()
+        times.append(time.perf_counter() - start)
+    return 1e3 * float(np.quantile(times, 0.25))

@@ -1,0 +1,134 @@
+"""The search against trying all: ``python -m experiments.simplest.evidence --out FILE.json``.
+
+On each scene every model is measured once; then the search runs on these measurements, so that
+both judge by the same errors and times, for several tolerances. Run it on an idle machine.
+"""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+
+from ..checks import check_out
+from ..console import say_table, stage
+from ..files.images import atomic_path
+from ..frontier.programs import Programs
+from ..provenance import commit, device, versions
+from ..scenes import load_scene
+from .bench import Bench, Measured
+from .models import Model, all_models
+from .search import Search
+from .sight import Measure, look_at_scene
+from .theory import Theory
+
+SCENES = (
+    "default", "sphere", "stacked", "thin-box", "grazing-plane", "skylights", "avenue",
+    "contact-wall", "two-occluders", "box-corner", "coarse-sphere", "bumpy", "displaced",
+    "mirror", "shadowed-relief", "spot", "projector", "room", "soft-lamp", "tall-and-short",
+)  # fmt: skip
+TOLERANCES = (0.05, 0.02, 0.01, 0.005, 0.0025)
+_MOST_PROGRAMS = 1500  # a process may map only so much
+
+
+def evidence(
+    *,
+    out: Annotated[Path, tyro.conf.arg(metavar="FILE", help="Where to write figures, .json.")],
+    scenes: Annotated[
+        tuple[str, ...],
+        tyro.conf.arg(metavar="SCENE", help="Scenes or mesh files, beside those chosen here."),
+    ] = (),
+    only: Annotated[bool, tyro.conf.arg(help="None but these scenes.")] = False,
+    measure: Annotated[Measure, tyro.conf.arg(help="Of errors.")] = "rmse",
+    image_size: Annotated[
+        int, tyro.conf.arg(metavar="N", help="Pixels on each side of the image.")
+    ] = 256,
+    runs: Annotated[int, tyro.conf.arg(help="Warm runs of each stage, at least.")] = 5,
+) -> None:  # fmt: skip
+    """Compare the search with exhaustive search on twenty scenes and more."""
+    check_out(out, ".json")
+    programs, rows = Programs(), []
+    for name in (*(() if only else SCENES), *scenes):
+        if len(programs) > _MOST_PROGRAMS:
+            programs = Programs()
+        with stage(name) as tell:
+            sight = look_at_scene(load_scene(name), image_size)
+            theory = Theory(sight, measure)
+            bench = Bench(sight, theory.slope, measure=measure, runs=runs, programs=programs)
+            models = all_models(sight.looks, sight.layout)
+            measured = {}
+            for k, model in enumerate(models):
+                tell(f"{k} of {len(models)}: {model.name}")
+                measured[model] = bench.measure(model)
+            for tolerance in TOLERANCES:
+                search = Search(sight, theory, models, measure)
+                rows.append({"scene": name} | compare(search, measured, tolerance))
+        made_with = {"versions": versions(), "device": device(), "commit": commit()}
+        what = {"rows": rows, "measure": measure, "image_size": image_size}
+        with atomic_path(out) as temporary:
+            temporary.write_text(json.dumps(what | made_with, indent=1) + "\n", "utf-8")
+    _print(rows)
+
+
+def compare(search: Search, measured: Mapping[Model, Measured], tolerance: float) -> dict[str, Any]:
+    """Return what a search finds among measured models, and the cheapest there is."""
+    end = search.run(lambda k: measured[search.models[k]], tolerance=tolerance)
+    enough = {m: found for m, found in measured.items() if found.error <= tolerance}
+    cheapest = min(enough, key=lambda m: enough[m].cost, default=None)
+    mine = None if end is None else search.models[end.best]
+    return {
+        "tolerance": tolerance,
+        "choice": None if mine is None else mine.name,
+        "error": None if mine is None else measured[mine].error,
+        "ms": None if mine is None else measured[mine].cost,
+        "cheapest": None if cheapest is None else cheapest.name,
+        "cheapest_ms": None if cheapest is None else measured[cheapest].cost,
+        "ratio": _ratio(mine, cheapest, measured),
+        "tried": len(search.tried),
+        "models": len(measured),
+    }
+
+
+def _ratio(mine: Model | None, cheapest: Model | None, measured: Mapping[Model, Measured]) -> float:
+    """Return the cost over the least that is enough; 1 if both find none, infinity if one does."""
+    if mine is None or cheapest is None:
+        return 1.0 if mine is cheapest else float("inf")
+    return measured[mine].cost / measured[cheapest].cost
+
+
+def _print(rows: list[dict[str, Any]]) -> None:
+    say_table(
+        "the search against trying every model",
+        ["scene", "tolerance", "choice", "ms", "cheapest", "ms", "ratio", "tried", "of"],
+        [
+            [
+                row["scene"], f"{row['tolerance']:g}", row["choice"] or "none reaches it",
+                _number(row["ms"]), row["cheapest"] or "none", _number(row["cheapest_ms"]),
+                f"{row['ratio']:.2f}", str(row["tried"]), str(row["models"]),
+            ]
+            for row in rows
+        ],
+    )  # fmt: skip
+    ratios = np.array([row["ratio"] for row in rows])
+    shares = np.array([row["tried"] / row["models"] for row in rows])
+    missed = sum(1 for row in rows if row["choice"] is not None and row["error"] > row["tolerance"])
+    say_table(
+        f"all {len(rows)}",
+        ["", "figure"],
+        [
+            ["share that costs at most 1.2 of the cheapest", f"{np.mean(ratios <= 1.2):.3f}"],
+            ["mean share of models that were tried", f"{shares.mean():.3f}"],
+            ["largest such share", f"{shares.max():.3f}"],
+            ["choices that miss the tolerance", str(missed)],
+        ],
+    )
+
+
+def _number(value: float | None) -> str:
+    return "" if value is None else f"{value:.2f}"
+
+
+if __name__ == "__main__":
+    tyro.cli(evidence)
