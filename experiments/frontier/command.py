@@ -54,7 +54,7 @@ def frontier(
         int, tyro.conf.arg(metavar="N", help="Pixels on each side of the image.")
     ] = 512,
     runs: Annotated[
-        int, tyro.conf.arg(help="Warm runs of each program at least, twice.")
+        int, tyro.conf.arg(help="Warm runs of each program, twice.")
     ] = 5,
     scheduler: Annotated[
         str | None,

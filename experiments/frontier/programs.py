@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-_ENOUGH_S = 0.03  # spent on a half of a stage's runs, at least as many as were asked for
-_MOST = 50
+_LITTLE_S, _MUCH_S = 0.03, 0.4  # spent on half of a stage's runs: more if below, fewer if above
+_MOST, _LEAST = 50, 2
 
 
 class Programs:
@@ -76,7 +76,8 @@ def time_stages(
     Args:
         stages: Programs by name; None for a stage that a method does not have.
         total: Stages that count together.
-        runs: Of each program, at least, twice: half of them after the other half of all.
+        runs: Of each program, twice: half of them after the other half of all. Fast programs run
+            more often, and slow ones less.
 
     Returns:
         Of each stage quartiles in ms (``ms``), seconds of compilation and temporary bytes;
@@ -100,8 +101,10 @@ def time_stages(
 def _run(timed: Timed, runs: int) -> list[float]:
     timed()
     times: list[float] = []
-    while len(times) < runs or (sum(times) < 1e3 * _ENOUGH_S and len(times) < _MOST):
+    while len(times) < (_MOST if sum(times) < 1e3 * _LITTLE_S else runs):
         start = time.perf_counter()
         timed()
         times.append(1e3 * (time.perf_counter() - start))
+        if sum(times) > 1e3 * _MUCH_S and len(times) >= _LEAST:
+            break
     return times

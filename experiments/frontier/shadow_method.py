@@ -36,6 +36,7 @@ Shared = tuple[Light, Surface, ShadowMap, Any]
 _FACTORS, _LENGTHS = (0.5, 0.75, 1.0, 1.5), (0.0, 0.3, 1.0, 2.0)  # reaches, texels
 _TOLERANCES = (0.0, 0.1, 0.3, 1.0, 3.0)  # texels
 _SOFT = SoftCompare(0.5)  # of derivatives
+_JUDGED = 1024  # size of the maps whose gradients are judged, which takes long to compile
 
 
 class Method(NamedTuple):
@@ -92,7 +93,7 @@ class Passes:
         draw = partial(_draw, method.map_size)
         self._draw = programs.get(f"draw {method.map_size}", draw, *self._drawing)
         self._map = self._draw()
-        self._prepare = programs.get(f"prepare {method.name}", self.filter.prepare, self._map)
+        self._prepare = programs.get(f"prepare {method.name}", _prepare, self.filter, self._map)
         self._prepared = self._prepare()
 
     def image(self, bias: Bias) -> Timed:
@@ -138,9 +139,9 @@ def accuracy(view: View, method: Method, programs: Programs) -> tuple[dict[str, 
     """Return how wrong a method is, at the best of the biases that suit its filter.
 
     Returns:
-        The figures of ``errors`` for the bias of least ``rmse``; that ``bias``; and
-        ``gradient_error``, how far derivatives of the visibility in the light's place are
-        from those of truth, as ``slope_error`` says. And its picture.
+        The figures of ``errors`` for the bias of least ``rmse``; that ``bias``; and, for maps
+        of 1024, ``gradient_error``: how far derivatives of the visibility in the light's place
+        are from those of truth, as ``slope_error`` says. And its picture.
     """
     passes = Passes(view, method, programs)
     covered = np.asarray(view.surface.covered)
@@ -153,10 +154,10 @@ def accuracy(view: View, method: Method, programs: Programs) -> tuple[dict[str, 
     assert best is not None
     _, bias, visibility, color = best
     passes.gradient(bias)  # compiled for ``timing``, which is to be alone
-    figures = errors(view, visibility, color) | {
-        "gradient_error": slope_error(passes.changes(bias), view.patterns, view.slopes),
-        "bias": _said(bias),
-    }
+    figures = errors(view, visibility, color) | {"bias": _said(bias)}
+    if method.map_size == _JUDGED:
+        changes = passes.changes(bias)
+        figures["gradient_error"] = slope_error(changes, view.patterns, view.slopes)
     return figures, picture(view, visibility, color)
 
 
@@ -206,6 +207,10 @@ def _draw(
         light, mesh.positions, camera, aspect=1.0, map_size=map_size, reach=reach
     )
     return render_shadow_map(mesh.positions, mesh.faces, matrices, map_size=map_size)
+
+
+def _prepare(filter: Filter, shadow_map: ShadowMap) -> Any:
+    return filter.prepare(shadow_map)
 
 
 def _visibility(
