@@ -103,9 +103,10 @@ def contenders(techniques: Sequence[str] = (), *, quick: bool = False) -> tuple[
     if techniques:
         return filters
     missing = absent()
-    say_notes(f"{name} left out: {reason}" for name, reason in missing.items())
-    peers = [peer for peer in PEERS if peer.technique not in missing]
-    return (*filters, *SHADING_METHODS, *peers)
+    say_notes([f"{name} left out: {reason}" for name, reason in missing.items()])
+    everyone: list[Contender] = [*filters, *SHADING_METHODS]
+    everyone += [peer for peer in PEERS if peer.technique not in missing]
+    return tuple(everyone)
 
 
 def table(

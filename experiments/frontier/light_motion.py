@@ -7,6 +7,7 @@ terminator. Means of truth are smooth in the angles, though each ray answers yes
 """
 
 from collections.abc import Callable
+from typing import Any, cast
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -34,8 +35,8 @@ def move_light(
         angles: Radians.
         center: Of the motion, world space.
     """
-    center = jnp.asarray(center)
-    away = light.direction if isinstance(light, DirectionalLight) else light.position - center
+    center, placed = jnp.asarray(center), cast(Any, light)  # all others have a position
+    away = placed.direction if isinstance(light, DirectionalLight) else placed.position - center
     least = jnp.eye(3, dtype=center.dtype)[jnp.argmin(jnp.abs(away))]
     right = safe_normalize(jnp.cross(away, least))
     up = safe_normalize(jnp.cross(right, away))

@@ -100,12 +100,12 @@ def light_finely(scene: Scene, light: Light, image_size: tuple[int, int]) -> Lit
     blocks = (height, _FINER, width, _FINER)
 
     @jax.jit
-    def fine(looks: Looks, light: Light) -> Lit:
+    def fine(looks: Looks, light: Light) -> tuple[Array, Array]:
         size = (_FINER * height, _FINER * width)
         surface = render_surface(looks.mesh, looks.camera, image_size=size)
         of_map = gather_faces(looks.face_materials[:, None], surface.face_ids)[..., 0] == mapped
         color = light_fragments(looks, surface, light).reshape(*blocks, 3).mean(axis=(1, 3))
-        return Lit(color, (of_map & surface.covered).reshape(blocks).all(axis=(1, 3)))
+        return color, (of_map & surface.covered).reshape(blocks).all(axis=(1, 3))
 
     arrays = jax.tree.map(jnp.asarray, (without_mips(looks), light))
     return Lit(*map(np.asarray, fine(*arrays)))

@@ -85,7 +85,7 @@ def time_stages(
         lies within them (``stable``).
     """
     there = {name: timed for name, timed in stages.items() if timed is not None}
-    halves = [{name: _run(timed, runs) for name, timed in there.items()} for _ in range(2)]
+    halves = [{name: run_times(timed, runs) for name, timed in there.items()} for _ in range(2)]
     figures: dict[str, Any] = dict.fromkeys(stages)
     for name, timed in there.items():
         quartiles = np.percentile([*halves[0][name], *halves[1][name]], [25, 50, 75])
@@ -98,7 +98,8 @@ def time_stages(
     }
 
 
-def _run(timed: Timed, runs: int) -> list[float]:
+def run_times(timed: Timed, runs: int) -> list[float]:
+    """Return the times of warm runs, ms; more of a fast program, and fewer of a slow one."""
     timed()
     times: list[float] = []
     while len(times) < (_MOST if sum(times) < 1e3 * _LITTLE_S else runs):

@@ -71,7 +71,7 @@ class ShadingMethod(NamedTuple):
         """Return ``rmse`` of the color, ``flip``, and the picture, where the map covers pixels."""
         assert view.lit is not None
         truth, counts = view.lit
-        color = np.array(self._image(view, programs)())
+        color = np.array(self._image(view, self._looks(view), programs)())
         color[~counts] = truth[~counts]
         rmse = float(np.sqrt(np.mean((color[counts] - truth[counts]) ** 2)))
         judged = view._replace(share=truth.mean(axis=-1))
@@ -85,15 +85,14 @@ class ShadingMethod(NamedTuple):
         if self.technique != _NONE:
             arguments = (looks, view.surface, view.light, view.lit.color)
             gradient = programs.get(f"gradient {self.label}", self._loss_gradient, *arguments)
-        image = self._image(view, programs)
+        image = self._image(view, looks, programs)
         stages = {"draw": None, "prepare": None, "image": image, "gradient": gradient}
         kept = jax.tree.leaves((looks.materials, looks.mesh.tangents))
         cost = time_stages(stages, total=("image",), runs=runs)
         return cost | {"kept_bytes": sum(leaf.nbytes for leaf in kept)}
 
-    def _image(self, view: View, programs: Programs) -> Timed:
-        arguments = (self._looks(view), view.surface, view.light)
-        return programs.get(f"image {self.label}", self._color, *arguments)
+    def _image(self, view: View, looks: Looks, programs: Programs) -> Timed:
+        return programs.get(f"image {self.label}", self._color, looks, view.surface, view.light)
 
     def _looks(self, view: View) -> Looks:
         """Return the scene with frames and textures as the method wants them."""

@@ -73,12 +73,43 @@ class Method(NamedTuple):
         return True
 
     def accuracy(self, view: View, programs: Programs) -> tuple[dict[str, Any], bytes]:
-        """Return its figures, and its picture."""
-        return accuracy(view, self, programs)
+        """Return how wrong it is, at the best of the biases that suit its filter.
+
+        Returns:
+            The figures of ``errors`` for the bias of least ``rmse``; that ``bias``; and, for maps
+            of 1024, ``gradient_error``: how far derivatives of the visibility in the light's place
+            are from those of truth, as ``slope_error`` says. And its picture.
+        """
+        passes = Passes(view, self, programs)
+        covered = np.asarray(view.surface.covered)
+        best: tuple[float, Bias, np.ndarray, np.ndarray] | None = None
+        for bias in biases(passes.filter):
+            visibility, color = map(np.asarray, passes.image(bias)())
+            rmse = soft_shadow_errors(visibility, view.share, covered).rmse
+            if best is None or rmse < best[0]:
+                best = rmse, bias, visibility, color
+        assert best is not None
+        _, bias, visibility, color = best
+        passes.gradient(bias)  # compiled for ``timing``, which is to be alone
+        figures = errors(view, visibility, color) | {"bias": _said(bias)}
+        if self.map_size == _JUDGED:
+            changes = passes.changes(bias)
+            figures["gradient_error"] = slope_error(changes, view.patterns, view.slopes)
+        return figures, picture(view, visibility, color)
 
     def timing(self, view: View, programs: Programs, *, runs: int) -> dict[str, Any]:
-        """Return its cost."""
-        return timing(view, self, programs, runs=runs)
+        """Return what it costs, compiled and warm: ``time_stages``, and ``kept_bytes``.
+
+        Args:
+            view: Where.
+            programs: Compiled so far.
+            runs: Of each program, as ``time_stages`` takes them.
+        """
+        passes = Passes(view, self, programs)
+        bias = biases(passes.filter)[0]
+        stages = passes.stages | {"image": passes.image(bias), "gradient": passes.gradient(bias)}
+        cost = time_stages(stages, total=("draw", "prepare", "image"), runs=runs)
+        return cost | {"kept_bytes": passes.kept_bytes}
 
 
 class Passes:
@@ -90,10 +121,10 @@ class Passes:
         self.filter = method.filter().for_light(view.light)
         scene, reach = view.scene, jnp.float32(self.filter.reach())
         self._drawing = (view.layout, scene.mesh, scene.camera, view.light, reach)
-        draw = partial(_draw, method.map_size)
+        draw = partial(draw_map, method.map_size)
         self._draw = programs.get(f"draw {method.map_size}", draw, *self._drawing)
         self._map = self._draw()
-        self._prepare = programs.get(f"prepare {method.name}", _prepare, self.filter, self._map)
+        self._prepare = programs.get(f"prepare {method.name}", prepare_map, self.filter, self._map)
         self._prepared = self._prepare()
 
     def image(self, bias: Bias) -> Timed:
@@ -135,48 +166,6 @@ class Passes:
         return self._view.light, self._view.surface, self._map, self._prepared
 
 
-def accuracy(view: View, method: Method, programs: Programs) -> tuple[dict[str, Any], bytes]:
-    """Return how wrong a method is, at the best of the biases that suit its filter.
-
-    Returns:
-        The figures of ``errors`` for the bias of least ``rmse``; that ``bias``; and, for maps
-        of 1024, ``gradient_error``: how far derivatives of the visibility in the light's place
-        are from those of truth, as ``slope_error`` says. And its picture.
-    """
-    passes = Passes(view, method, programs)
-    covered = np.asarray(view.surface.covered)
-    best: tuple[float, Bias, np.ndarray, np.ndarray] | None = None
-    for bias in biases(passes.filter):
-        visibility, color = map(np.asarray, passes.image(bias)())
-        rmse = soft_shadow_errors(visibility, view.share, covered).rmse
-        if best is None or rmse < best[0]:
-            best = rmse, bias, visibility, color
-    assert best is not None
-    _, bias, visibility, color = best
-    passes.gradient(bias)  # compiled for ``timing``, which is to be alone
-    figures = errors(view, visibility, color) | {"bias": _said(bias)}
-    if method.map_size == _JUDGED:
-        changes = passes.changes(bias)
-        figures["gradient_error"] = slope_error(changes, view.patterns, view.slopes)
-    return figures, picture(view, visibility, color)
-
-
-def timing(view: View, method: Method, programs: Programs, *, runs: int) -> dict[str, Any]:
-    """Return what a method costs, compiled and warm: ``time_stages``, and ``kept_bytes``.
-
-    Args:
-        view: Where.
-        method: What.
-        programs: Compiled so far.
-        runs: Of each program, as ``time_stages`` takes them.
-    """
-    passes = Passes(view, method, programs)
-    bias = biases(passes.filter)[0]
-    stages = passes.stages | {"image": passes.image(bias), "gradient": passes.gradient(bias)}
-    cost = time_stages(stages, total=("draw", "prepare", "image"), runs=runs)
-    return cost | {"kept_bytes": passes.kept_bytes}
-
-
 def biases(filter: Filter) -> list[Bias]:
     """Return the biases that are tried, the default one's like first."""
     if not filter.needs_bias:
@@ -199,7 +188,7 @@ def _said(bias: Bias) -> str:
     return " and ".join(said) or "none"
 
 
-def _draw(
+def draw_map(
     map_size: int, layout: Layout, mesh: Mesh, camera: Camera, light: Light, reach: Array
 ) -> ShadowMap:
     """Return the light's map; the pass is the same for every filter."""
@@ -209,7 +198,8 @@ def _draw(
     return render_shadow_map(mesh.positions, mesh.faces, matrices, map_size=map_size)
 
 
-def _prepare(filter: Filter, shadow_map: ShadowMap) -> Any:
+def prepare_map(filter: Filter, shadow_map: ShadowMap) -> Any:
+    """Return what the filter makes of the map."""
     return filter.prepare(shadow_map)
 
 
@@ -249,7 +239,7 @@ def _draw_change(
     """Return the light's map, and how it changes as the light begins to move."""
 
     def draw(angles: Array) -> ShadowMap:
-        return _draw(map_size, layout, mesh, camera, move_light(light, angles, center), reach)
+        return draw_map(map_size, layout, mesh, camera, move_light(light, angles, center), reach)
 
     return jax.jvp(draw, (jnp.zeros_like(step),), (step,))
 

@@ -12,14 +12,13 @@ from shadows.layouts import Layout
 from shadows.lights import Light
 from shadows.render import shade
 from shadows.surface import Surface, render_surface
-from tangentspace._math import dot
 
 from ..checks import check_scene
 from ..rendering.prepare_scene import prepare_scene
 from ..scene import Scene
 from ..scenes import load_scene
 from ..technique_words import choose_layout
-from ..truth.area import seen_share
+from ..truth.area import surface_share
 from ..truth.rays import Occluders
 from .light_motion import Patterns, patterns, truth_slopes
 from .lit_map import Lit, light_finely
@@ -78,7 +77,7 @@ def load_view(name: str, image_size: int) -> View:
     size = (image_size, image_size)
     surface = jax.jit(lambda mesh, camera: render_surface(mesh, camera, image_size=size))(*arrays)
     occluders = Occluders(scene.mesh.positions, scene.mesh.faces)
-    facing, share = _seen(surface, light, occluders)
+    facing, share = surface_share(surface, light, occluders)
     light = jax.tree.map(jnp.asarray, light)
     color = jax.jit(lambda share: shade(surface, (light,), (share,)))(jnp.asarray(share))
     center = np.asarray(surface.position)[np.asarray(surface.covered)].mean(axis=0)
@@ -88,7 +87,8 @@ def load_view(name: str, image_size: int) -> View:
     def seen(light: Light) -> Float[np.ndarray, "height width"]:
         found = np.zeros_like(share)
         some = np.s_[::sparse, ::sparse]
-        found[some] = _seen(jax.tree.map(lambda a: a[some], surface), light, occluders)[1]
+        part = jax.tree.map(lambda a: a[some], surface)
+        found[some] = surface_share(part, light, occluders)[1]
         return found * sparse**2
 
     slopes = truth_slopes(seen, light, weights, center)
@@ -97,14 +97,3 @@ def load_view(name: str, image_size: int) -> View:
         scene.name, moved, light, layout, surface, facing, share, np.asarray(color),
         center, weights, slopes, light_finely(scene, light, size),
     )  # fmt: skip
-
-
-def _seen(
-    surface: Surface, light: Light, occluders: Occluders
-) -> tuple[Bool[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
-    """Return which pixels face a light, and the share of it that they see."""
-    position, normal, ids = surface.position, surface.face_normal, surface.face_ids
-    places = np.asarray(position), np.asarray(normal), np.asarray(ids)
-    towards = np.asarray(dot(normal, light.to_light(position)))
-    facing = np.asarray(surface.covered) & (towards > 0)
-    return facing, np.where(facing, seen_share(*places, light, occluders), 0.0)

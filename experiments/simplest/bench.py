@@ -7,7 +7,6 @@ The eye's pass is the same for all, and not counted.
 """
 
 import functools
-import time
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -18,15 +17,13 @@ from jaxtyping import Array, Float
 from shadows.bias import Bias
 from shadows.compare import HardCompare
 from shadows.filters import Filter
-from shadows.layouts import Layout
 from shadows.lights import Light
 from shadows.render import surface_visibility
-from shadows.shadow_map import ShadowMap, render_shadow_map
+from shadows.shadow_map import ShadowMap
 from shadows.surface import Surface
-from shadows.transforms import Camera
-from tangentspace.mesh import Mesh
 
-from ..frontier.programs import Programs, Timed
+from ..frontier.programs import Programs, Timed, run_times
+from ..frontier.shadow_method import draw_map, prepare_map
 from ..options import parse_technique
 from ..technique_words import parse_bias
 from .models import Model, bias_words, filters
@@ -91,7 +88,9 @@ class Bench:
         picture, timed = self._made(model)
         for stage, programs in timed.items():
             if stage not in self._ms:
-                self._ms[stage] = sum(_run(program, self._runs) for program in programs)
+                # The lower quartile, which other load disturbs less.
+                times = [np.quantile(run_times(p, self._runs), 0.25) for p in programs]
+                self._ms[stage] = float(sum(times))
         error = self.sight.error(picture, self._measure)
         return Measured(error, {stage: self._ms[stage] for stage in timed})
 
@@ -117,12 +116,12 @@ class Bench:
         scene = self.sight.scene
         draw = self._programs.get(
             f"simplest draw {model.map_size}",
-            partial(_draw, model.map_size),
+            partial(draw_map, model.map_size),
             self.sight.layout, scene.mesh, scene.camera, light, jnp.float32(filter.reach()),
         )  # fmt: skip
         shadow_map = draw()
         name = f"{model.filter} {model.map_size}"
-        prepare = self._programs.get(f"simplest prepare {name}", _prepare, filter, shadow_map)
+        prepare = self._programs.get(f"simplest prepare {name}", prepare_map, filter, shadow_map)
         look_up = self._programs.get(
             f"simplest look up {name}", _look_up, bias, filter, light, self.sight.surface,
             shadow_map, prepare(),
@@ -145,33 +144,9 @@ def _parsed(filter_name: str, bias: str, slope: float) -> tuple[Filter, Bias]:
     return filter, parse_bias(bias_words(bias, slope), filter)
 
 
-def _draw(
-    map_size: int, layout: Layout, mesh: Mesh, camera: Camera, light: Light, reach: Array
-) -> ShadowMap:
-    matrices = layout.matrices(
-        light, mesh.positions, camera, aspect=1.0, map_size=map_size, reach=reach
-    )
-    return render_shadow_map(mesh.positions, mesh.faces, matrices, map_size=map_size)
-
-
-def _prepare(filter: Filter, shadow_map: ShadowMap) -> Any:
-    return filter.prepare(shadow_map)
-
-
 def _look_up(
     bias: Bias, filter: Filter, light: Light, surface: Surface, shadow_map: ShadowMap, kept: Any
 ) -> Float[Array, "height width"]:
     return surface_visibility(
         surface, light, shadow_map, bias=bias, filter=filter, compare=HardCompare(), prepared=kept
     )
-
-
-def _run(program: Timed, runs: int) -> float:
-    """Return the time of a run in ms: the lower quartile, which other load disturbs less."""
-    program()
-    times = []
-    while len(times) < runs or (sum(times) < 0.02 and len(times) < 4 * runs):
-        start = time.perf_counter()
-        program()
-        times.append(time.perf_counter() - start)
-    return 1e3 * float(np.quantile(times, 0.25))

@@ -21,7 +21,6 @@ from shadows.lights import Light
 from shadows.render import shade
 from shadows.surface import Surface, render_surface
 from shadows.transforms import Camera
-from tangentspace._math import dot
 from tangentspace.environment import CubeMap
 from tangentspace.material import Material
 from tangentspace.mesh import Mesh
@@ -32,7 +31,7 @@ from ..files.images import linear_to_srgb
 from ..rendering.prepare_scene import prepare_scene
 from ..scene import Scene
 from ..technique_words import choose_layout
-from ..truth.area import seen_share
+from ..truth.area import surface_share
 from ..truth.rays import Occluders
 from .models import LOOKS
 
@@ -182,12 +181,7 @@ def _see(mesh: Mesh, camera: Camera, *, image_size: int) -> Surface:
 
 
 def _trace(light: Light, surface: Surface, occluders: Occluders) -> Seen:
-    position, normal = np.asarray(surface.position), np.asarray(surface.face_normal)
-    towards = np.asarray(dot(surface.face_normal, light.to_light(surface.position)))
-    facing = np.asarray(surface.covered) & (towards > 0)
-    seen = seen_share(position, normal, np.asarray(surface.face_ids), light, occluders)
-    share = np.where(facing, seen, 0.0)
-    return Seen(jax.tree.map(jnp.asarray, light), facing, share)
+    return Seen(jax.tree.map(jnp.asarray, light), *surface_share(surface, light, occluders))
 
 
 def _mean(values: np.ndarray) -> float:

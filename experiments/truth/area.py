@@ -1,10 +1,12 @@
 """Ray-traced soft shadows: the share of a light that each surface point sees."""
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from shadows.area_lights import AreaLight
 from shadows.lights import Light, PointLight
+from shadows.surface import Surface
+from tangentspace._math import dot
 
 from .rays import FaceIds, Occluders, Vectors, trace_visibility
 
@@ -26,6 +28,17 @@ def seen_share(
     if isinstance(light, AreaLight):
         return area_visibility(*points, light, occluders, samples=LIGHT_SAMPLES)
     return trace_visibility(*points, light, occluders).astype(np.float64)
+
+
+def surface_share(
+    surface: Surface, light: Light, occluders: Occluders
+) -> tuple[Bool[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
+    """Return which pixels of a view face a light, and the share of it that they see; else 0."""
+    position, normal, ids = surface.position, surface.face_normal, surface.face_ids
+    towards = np.asarray(dot(normal, light.to_light(position)))
+    facing = np.asarray(surface.covered) & (towards > 0)
+    share = seen_share(np.asarray(position), np.asarray(normal), np.asarray(ids), light, occluders)
+    return facing, np.where(facing, share, 0.0)
 
 
 def area_visibility(
