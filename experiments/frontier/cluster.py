@@ -7,7 +7,7 @@ what it was at is measured by another.
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from .run import ACCURACY, TIMING, Cell, Measured, measure
+from .run import ACCURACY, TIMINGS, Cell, Measured, measure
 
 _PATIENCE_S = 10
 
@@ -44,7 +44,7 @@ def measure_on(client: Any, cells: Iterable[Cell]) -> Iterator[tuple[Cell, Measu
     if not client.scheduler_info()["workers"]:
         raise ValueError("--scheduler: has no workers; start some with `dask worker ADDRESS`")
     cells = list(cells)
-    for what in (ACCURACY, TIMING):
+    for what in (ACCURACY, *TIMINGS):
         futures = {
             client.submit(measure, cell, pure=False): cell for cell in cells if cell.what == what
         }

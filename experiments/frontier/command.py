@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -22,7 +22,8 @@ from .errors import FIGURES
 from .methods import methods
 from .page import save_page
 from .peers import PEERS, absent
-from .run import ACCURACY, TIMING, Cell, Contender, measure_here, run
+from .programs import summarize
+from .run import ACCURACY, TIMINGS, Cell, Contender, measure_here, run
 from .shading_method import SHADING_METHODS
 from .store import Key, Store
 
@@ -54,8 +55,8 @@ def frontier(
         int, tyro.conf.arg(metavar="N", help="Pixels on each side of the image.")
     ] = 512,
     runs: Annotated[
-        int, tyro.conf.arg(help="Warm runs of each program, twice.")
-    ] = 5,
+        int, tyro.conf.arg(help="Warm runs of each program, in each of two rounds.")
+    ] = 3,
     scheduler: Annotated[
         str | None,
         tyro.conf.arg(metavar="ADDRESS", help="Dask scheduler whose workers measure, as in "
@@ -78,7 +79,7 @@ def frontier(
     chosen = contenders(techniques, quick=quick)
     cells = [
         Cell(what, scene, contender, image_size, runs)
-        for scene, contender, what in product(names, chosen, (ACCURACY, TIMING))
+        for scene, contender, what in product(names, chosen, (ACCURACY, *TIMINGS))
     ]
     measured = measure_here
     if scheduler is not None:
@@ -104,9 +105,8 @@ def contenders(techniques: Sequence[str] = (), *, quick: bool = False) -> tuple[
         return filters
     missing = absent()
     say_notes([f"{name} left out: {reason}" for name, reason in missing.items()])
-    everyone: list[Contender] = [*filters, *SHADING_METHODS]
-    everyone += [peer for peer in PEERS if peer.technique not in missing]
-    return tuple(everyone)
+    peers = [peer for peer in PEERS if peer.technique not in missing]
+    return *filters, *SHADING_METHODS, *cast(Sequence[Contender], peers)
 
 
 def table(
@@ -114,10 +114,14 @@ def table(
 ) -> Iterator[dict[str, Any]]:
     """Yield a flat row for each scene and contender that is for it."""
     for scene, contender in product(scenes, chosen):
-        keys = [Key(what, scene, contender.name, image_size) for what in (ACCURACY, TIMING)]
-        found, cost = (store.get(key) or {} for key in keys)
-        if not cost:
+        kept = [
+            store.get(Key(what, scene, contender.name, image_size)) or {}
+            for what in (ACCURACY, *TIMINGS)
+        ]
+        found, rounds = kept[0], kept[1:]
+        if not all(rounds):
             continue
+        cost = summarize([one["stages"] for one in rounds])
         row = {
             "scene": scene, "kind": contender.kind, "name": contender.name,
             "technique": contender.technique, "setting": contender.label,
@@ -125,7 +129,7 @@ def table(
             **dict.fromkeys(FIGURES), **found,
             "total_ms": cost["total_ms"][1], "total_ms_low": cost["total_ms"][0],
             "total_ms_high": cost["total_ms"][2],
-            "kept_bytes": cost["kept_bytes"], "stable": cost["stable"],
+            "kept_bytes": rounds[0]["kept_bytes"], "stable": cost["stable"],
         }  # fmt: skip
         for part in ("draw", "prepare", "image", "gradient"):
             of_part = cost[part] or {"ms": [None] * 3, "compile_s": None, "temporary_bytes": None}

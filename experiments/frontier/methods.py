@@ -18,6 +18,7 @@ _SIZES = {
 }
 MAP_SIZES = (256, 512, 1024, 2048)
 QUICK_MAP_SIZES = (256, 1024)
+_JUDGED = 1024  # maps at which gradients of the first size of each filter are judged
 
 
 def methods(names: Sequence[str] = (), *, quick: bool = False) -> tuple[Method, ...]:
@@ -39,5 +40,8 @@ def methods(names: Sequence[str] = (), *, quick: bool = False) -> tuple[Method, 
         for name in names or known:
             sizes = _SIZES.get(name, {name: ()})
             chosen = list(sizes.items())[: 1 if quick else None]
-            found += [Method(name, label, (name, *more), map_size) for label, more in chosen]
+            found += [
+                Method(name, label, (name, *more), map_size, (map_size, k) == (_JUDGED, 0))
+                for k, (label, more) in enumerate(chosen)
+            ]
     return tuple(found)

@@ -10,8 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-_LITTLE_S, _MUCH_S = 0.03, 0.4  # spent on half of a stage's runs: more if below, fewer if above
+_LITTLE_S, _MUCH_S = 0.03, 0.4  # spent on a stage: more runs if below, fewer if above
 _MOST, _LEAST = 50, 2
+_SLOW_S = 0.1  # a program so slow needs no warming
+_OF_IMAGE = ("draw", "prepare", "image")  # stages that make an image
 
 
 class Programs:
@@ -68,44 +70,59 @@ class Timed:
         return jax.block_until_ready(self._program(*self._arguments))
 
 
-def time_stages(
-    stages: Mapping[str, Timed | None], *, total: Sequence[str], runs: int
-) -> dict[str, Any]:
-    """Return what the stages of a method cost, warm.
+def time_stages(stages: Mapping[str, Timed | None], *, runs: int) -> dict[str, Any]:
+    """Return what the stages of a method cost, compiled and warm.
 
     Args:
         stages: Programs by name; None for a stage that a method does not have.
-        total: Stages that count together.
-        runs: Of each program, twice: half of them after the other half of all. Fast programs run
-            more often, and slow ones less.
+        runs: Of each program, see ``run_times``.
 
     Returns:
-        Of each stage quartiles in ms (``ms``), seconds of compilation and temporary bytes;
-        ``total_ms``, quartiles of the sum of some; and whether each half's median of it
-        lies within them (``stable``).
+        Of each stage times in ms (``ms``), seconds of compilation and temporary bytes; None of
+        a stage that it does not have.
     """
-    there = {name: timed for name, timed in stages.items() if timed is not None}
-    halves = [{name: run_times(timed, runs) for name, timed in there.items()} for _ in range(2)]
-    figures: dict[str, Any] = dict.fromkeys(stages)
-    for name, timed in there.items():
-        quartiles = np.percentile([*halves[0][name], *halves[1][name]], [25, 50, 75])
-        figures[name] = timed.cost | {"ms": [round(float(t), 4) for t in quartiles]}
-    medians = [sum(np.median(half[name]) for name in total if name in there) for half in halves]
-    sums = np.sum([figures[name]["ms"] for name in total if name in there], axis=0)
+    return {
+        name: timed and timed.cost | {"ms": [round(t, 4) for t in run_times(timed, runs)]}
+        for name, timed in stages.items()
+    }
+
+
+def summarize(rounds: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the quartiles of what was timed in several rounds.
+
+    Args:
+        rounds: Of ``time_stages``, some time apart.
+
+    Returns:
+        The first round with quartiles for times; ``total_ms``, quartiles of the sum of all
+        stages of an image; and whether each round's median of it lies within (``stable``).
+    """
+    figures = dict(rounds[0])
+    for name, cost in rounds[0].items():
+        if cost is not None:
+            times = np.concatenate([one[name]["ms"] for one in rounds])
+            figures[name] = cost | {"ms": np.percentile(times, [25, 50, 75]).round(4).tolist()}
+    there = [name for name in _OF_IMAGE if figures[name] is not None]
+    sums = np.sum([figures[name]["ms"] for name in there], axis=0)
+    medians = [sum(np.median(one[name]["ms"]) for name in there) for one in rounds]
     return figures | {
         "total_ms": sums.tolist(),
-        "stable": bool(all(sums[0] <= of_half <= sums[2] for of_half in medians)),
+        "stable": all(bool(sums[0] <= median <= sums[2]) for median in medians),
     }
 
 
 def run_times(timed: Timed, runs: int) -> list[float]:
     """Return the times of warm runs, ms; more of a fast program, and fewer of a slow one."""
-    timed()
-    times: list[float] = []
+    warming = _run_time(timed)
+    times = [warming] if warming > 1e3 * _SLOW_S else []
     while len(times) < (_MOST if sum(times) < 1e3 * _LITTLE_S else runs):
-        start = time.perf_counter()
-        timed()
-        times.append(1e3 * (time.perf_counter() - start))
+        times.append(_run_time(timed))
         if sum(times) > 1e3 * _MUCH_S and len(times) >= _LEAST:
             break
     return times
+
+
+def _run_time(timed: Timed) -> float:
+    start = time.perf_counter()
+    timed()
+    return 1e3 * (time.perf_counter() - start)

@@ -79,7 +79,7 @@ class ShadingMethod(NamedTuple):
         return {"rmse": rmse, "flip": mean_flip(truth, color)}, shown
 
     def timing(self, view: View, programs: Programs, *, runs: int) -> dict[str, Any]:
-        """Return the cost of looking up, lighting, and the gradient in the map's texels."""
+        """Return a round of what looking up, lighting and the gradient in texels cost."""
         assert view.lit is not None
         looks, gradient = self._looks(view), None
         if self.technique != _NONE:
@@ -87,9 +87,8 @@ class ShadingMethod(NamedTuple):
             gradient = programs.get(f"gradient {self.label}", self._loss_gradient, *arguments)
         image = self._image(view, looks, programs)
         stages = {"draw": None, "prepare": None, "image": image, "gradient": gradient}
-        kept = jax.tree.leaves((looks.materials, looks.mesh.tangents))
-        cost = time_stages(stages, total=("image",), runs=runs)
-        return cost | {"kept_bytes": sum(leaf.nbytes for leaf in kept)}
+        kept = sum(leaf.nbytes for leaf in jax.tree.leaves((looks.materials, looks.mesh.tangents)))
+        return {"stages": time_stages(stages, runs=runs), "kept_bytes": kept}
 
     def _image(self, view: View, looks: Looks, programs: Programs) -> Timed:
         return programs.get(f"image {self.label}", self._color, looks, view.surface, view.light)

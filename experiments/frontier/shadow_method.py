@@ -27,16 +27,17 @@ from tangentspace.mesh import Mesh
 from ..metrics import soft_shadow_errors
 from ..options import parse_technique
 from .errors import errors
+from .light_form import light_form
 from .light_motion import move_light, slope_error
 from .pictures import picture
 from .programs import Programs, Timed, time_stages
 from .view import View
 
 Shared = tuple[Light, Surface, ShadowMap, Any]
+Drawn = tuple[ShadowMap, Light]
 _FACTORS, _LENGTHS = (0.5, 0.75, 1.0, 1.5), (0.0, 0.3, 1.0, 2.0)  # reaches, texels
 _TOLERANCES = (0.0, 0.1, 0.3, 1.0, 3.0)  # texels
 _SOFT = SoftCompare(0.5)  # of derivatives
-_JUDGED = 1024  # size of the maps whose gradients are judged, which takes long to compile
 
 
 class Method(NamedTuple):
@@ -47,12 +48,15 @@ class Method(NamedTuple):
         label: Name with its size, ``pcf 5x5``.
         words: What ``--filter`` takes.
         map_size: Texels on each side.
+        judges_gradient: Whether to measure how right its gradients are, too, which takes as long
+            as all else.
     """
 
     technique: str
     label: str
     words: tuple[str, ...]
     map_size: int
+    judges_gradient: bool = False
 
     @property
     def kind(self) -> str:
@@ -76,9 +80,9 @@ class Method(NamedTuple):
         """Return how wrong it is, at the best of the biases that suit its filter.
 
         Returns:
-            The figures of ``errors`` for the bias of least ``rmse``; that ``bias``; and, for maps
-            of 1024, ``gradient_error``: how far derivatives of the visibility in the light's place
-            are from those of truth, as ``slope_error`` says. And its picture.
+            The figures of ``errors`` for the bias of least ``rmse``; that ``bias``; and, if it is
+            to, ``gradient_error``: how far derivatives of the visibility in the light's place are
+            from those of truth, as ``slope_error`` says. And its picture.
         """
         passes = Passes(view, self, programs)
         covered = np.asarray(view.surface.covered)
@@ -92,13 +96,13 @@ class Method(NamedTuple):
         _, bias, visibility, color = best
         passes.gradient(bias)  # compiled for ``timing``, which is to be alone
         figures = errors(view, visibility, color) | {"bias": _said(bias)}
-        if self.map_size == _JUDGED:
+        if self.judges_gradient:
             changes = passes.changes(bias)
             figures["gradient_error"] = slope_error(changes, view.patterns, view.slopes)
         return figures, picture(view, visibility, color)
 
     def timing(self, view: View, programs: Programs, *, runs: int) -> dict[str, Any]:
-        """Return what it costs, compiled and warm: ``time_stages``, and ``kept_bytes``.
+        """Return a round of ``time_stages``, and ``kept_bytes``.
 
         Args:
             view: Where.
@@ -108,8 +112,7 @@ class Method(NamedTuple):
         passes = Passes(view, self, programs)
         bias = biases(passes.filter)[0]
         stages = passes.stages | {"image": passes.image(bias), "gradient": passes.gradient(bias)}
-        cost = time_stages(stages, total=("draw", "prepare", "image"), runs=runs)
-        return cost | {"kept_bytes": passes.kept_bytes}
+        return {"stages": time_stages(stages, runs=runs), "kept_bytes": passes.kept_bytes}
 
 
 class Passes:
@@ -118,6 +121,7 @@ class Passes:
     def __init__(self, view: View, method: Method, programs: Programs) -> None:
         """Draw the map and prepare it."""
         self._view, self._method, self._programs = view, method, programs
+        self._light = light_form(view.light)
         self.filter = method.filter().for_light(view.light)
         scene, reach = view.scene, jnp.float32(self.filter.reach())
         self._drawing = (view.layout, scene.mesh, scene.camera, view.light, reach)
@@ -139,15 +143,15 @@ class Passes:
 
     def changes(self, bias: Bias) -> Float[np.ndarray, "2 height width"]:
         """Return the derivatives of the visibility as the light moves, at a soft comparison."""
-        center, changes = self._view.center, []
-        draw = partial(_draw_change, self._method.map_size)
-        for step in np.eye(2, dtype=np.float32):
+        changes, size = [], self._method.map_size
+        for step in jnp.eye(2):
             drawn = self._programs.get(
-                f"draw change {self._method.map_size}", draw, step, center, *self._drawing
-            )
+                f"draw change {size}", partial(_draw_change, size),
+                step, self._view.center, *self._drawing,
+            )  # fmt: skip
             change = self._programs.get(
                 f"change {self._method.name}", _change,
-                step, center, bias, self.filter, self._view.light, self._view.surface, *drawn(),
+                bias, self.filter, self._view.surface, *drawn(),
             )  # fmt: skip
             changes.append(np.asarray(change()))
         return np.stack(changes)
@@ -163,7 +167,7 @@ class Passes:
         return sum(leaf.nbytes for leaf in jax.tree.leaves((self._map, self._prepared)))
 
     def _shared(self) -> Shared:
-        return self._view.light, self._view.surface, self._map, self._prepared
+        return self._light, self._view.surface, self._map, self._prepared
 
 
 def biases(filter: Filter) -> list[Bias]:
@@ -235,25 +239,25 @@ def _loss_gradient(
 def _draw_change(
     map_size: int, step: Array, center: Array,
     layout: Layout, mesh: Mesh, camera: Camera, light: Light, reach: Array,
-) -> tuple[ShadowMap, ShadowMap]:  # fmt: skip
-    """Return the light's map, and how it changes as the light begins to move."""
+) -> tuple[Drawn, Drawn]:  # fmt: skip
+    """Return the light's map and the light, and how they change as the light begins to move."""
 
-    def draw(angles: Array) -> ShadowMap:
-        return draw_map(map_size, layout, mesh, camera, move_light(light, angles, center), reach)
+    def draw(angles: Array) -> Drawn:
+        moved = move_light(light, angles, center)
+        return draw_map(map_size, layout, mesh, camera, moved, reach), light_form(moved)
 
     return jax.jvp(draw, (jnp.zeros_like(step),), (step,))
 
 
 def _change(
-    step: Array, center: Array, bias: Bias, filter: Filter, light: Light, surface: Surface,
-    shadow_map: ShadowMap, change: ShadowMap,
-) -> Float[Array, "height width"]:  # fmt: skip
-    """Return the derivative of the visibility as the light begins to move, and its map."""
+    bias: Bias, filter: Filter, surface: Surface, drawn: Drawn, change: Drawn
+) -> Float[Array, "height width"]:
+    """Return the derivative of the visibility as the map and the light change."""
 
-    def seen(angles: Array, shadow_map: ShadowMap) -> Array:
-        moved = move_light(light, angles, center)
+    def seen(drawn: Drawn) -> Array:
+        shadow_map, light = drawn
         prepared = filter.prepare(shadow_map)
-        return _visibility(bias, filter, _SOFT, (moved, surface, shadow_map, prepared))
+        return _visibility(bias, filter, _SOFT, (light, surface, shadow_map, prepared))
 
-    _, tangent = jax.jvp(seen, (jnp.zeros_like(step), shadow_map), (step, change))
+    _, tangent = jax.jvp(seen, (drawn,), (change,))
     return tangent

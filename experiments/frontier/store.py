@@ -14,14 +14,14 @@ from typing import Any, NamedTuple
 from ..console import say_notes
 from ..files.images import atomic_path
 
-FORMAT = 2  # of the files; another means a folder that this version cannot go on with
+FORMAT = 3  # of the files; another means a folder that this version cannot go on with
 
 
 class Key(NamedTuple):
     """What was measured.
 
     Attributes:
-        kind: ``accuracy``, which is the same in every run, or ``timing``.
+        kind: ``accuracy``, which is the same in every run, or a round of timing.
         scene: Name or file.
         method: ``Method.name``.
         image_size: Pixels on each side of the image.

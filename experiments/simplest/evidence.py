@@ -1,21 +1,23 @@
-"""The search against trying all: ``python -m experiments.simplest.evidence --out FILE.json``.
+"""The search against trying all: ``python -m experiments.simplest.evidence --out DIR``.
 
 On each scene every model is measured once; then the search runs on these measurements, so that
-both judge by the same errors and times, for several tolerances. Run it on an idle machine.
+both judge by the same errors and times, for several tolerances. Run it on an idle machine; a run
+that was stopped goes on in its folder with the next scene.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import tyro
 
-from ..checks import check_out
+from ..checks import check_folder, make_folder
 from ..console import say_table, stage
 from ..files.images import atomic_path
 from ..frontier.programs import Programs
+from ..frontier.store import Key, Store
 from ..provenance import commit, device, versions
 from ..scenes import load_scene
 from .bench import Bench, Measured
@@ -35,7 +37,8 @@ _MOST_PROGRAMS = 1500  # a process may map only so much
 
 def evidence(
     *,
-    out: Annotated[Path, tyro.conf.arg(metavar="FILE", help="Where to write figures, .json.")],
+    out: Annotated[Path, tyro.conf.arg(metavar="DIR", help="Folder for evidence.json and for "
+                                       "what was measured.")],
     scenes: Annotated[
         tuple[str, ...],
         tyro.conf.arg(metavar="SCENE", help="Scenes or mesh files, beside those chosen here."),
@@ -48,28 +51,46 @@ def evidence(
     runs: Annotated[int, tyro.conf.arg(help="Warm runs of each stage, at least.")] = 5,
 ) -> None:  # fmt: skip
     """Compare the search with exhaustive search on twenty scenes and more."""
-    check_out(out, ".json")
-    programs, rows = Programs(), []
+    check_folder(out)
+    make_folder(out)
+    store, programs, rows = Store(out), Programs(), []
     for name in (*(() if only else SCENES), *scenes):
         if len(programs) > _MOST_PROGRAMS:
             programs = Programs()
         with stage(name) as tell:
             sight = look_at_scene(load_scene(name), image_size)
             theory = Theory(sight, measure)
-            bench = Bench(sight, theory.slope, measure=measure, runs=runs, programs=programs)
             models = all_models(sight.looks, sight.layout)
-            measured = {}
-            for k, model in enumerate(models):
-                tell(f"{k} of {len(models)}: {model.name}")
-                measured[model] = bench.measure(model)
+            key = Key("exhaustive", name, measure, image_size)
+            found = store.get(key)
+            if found is None:
+                bench = Bench(sight, theory.slope, measure=measure, runs=runs, programs=programs)
+                store.put(key, dict(_measure_all(bench, models, tell)))
+                found = store.get(key) or {}
+            measured = {m: _told(found[m.name]) for m in models}
             for tolerance in TOLERANCES:
                 search = Search(sight, theory, models, measure)
                 rows.append({"scene": name} | compare(search, measured, tolerance))
         made_with = {"versions": versions(), "device": device(), "commit": commit()}
         what = {"rows": rows, "measure": measure, "image_size": image_size}
-        with atomic_path(out) as temporary:
+        with atomic_path(out / "evidence.json") as temporary:
             temporary.write_text(json.dumps(what | made_with, indent=1) + "\n", "utf-8")
     _print(rows)
+
+
+def _measure_all(
+    bench: Bench, models: Sequence[Model], tell: Callable[[str], None]
+) -> Iterator[tuple[str, tuple[float, list]]]:
+    """Yield every model's name and what was found of it, in a form for JSON."""
+    for k, model in enumerate(models):
+        tell(f"{k} of {len(models)}: {model.name}")
+        error, ms = bench.measure(model)
+        yield model.name, (error, list(ms.items()))
+
+
+def _told(found: tuple[float, list]) -> Measured:
+    error, ms = found
+    return Measured(error, {tuple(stage): time for stage, time in ms})
 
 
 def compare(search: Search, measured: Mapping[Model, Measured], tolerance: float) -> dict[str, Any]:

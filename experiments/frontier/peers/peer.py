@@ -127,8 +127,7 @@ class Peer(abc.ABC):
                 "image": _timed(lambda: _shaded(view, programs, _faced(view, work))),
                 "gradient": None,
             }
-            cost = time_stages(stages, total=("draw", "prepare", "image"), runs=runs)
-        return cost | {"kept_bytes": work.kept_bytes}
+            return {"stages": time_stages(stages, runs=runs), "kept_bytes": work.kept_bytes}
 
 
 def _faced(view: View, work: Work) -> Image:
