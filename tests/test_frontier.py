@@ -12,6 +12,7 @@ import pytest
 import experiments.frontier.command as command
 import experiments.frontier.programs as programs_module
 from experiments.frontier.chart import front, save_chart
+from experiments.frontier.light_form import LightForm, light_form
 from experiments.frontier.light_motion import move_light, slope_error, truth_slopes
 from experiments.frontier.methods import MAP_SIZES, methods
 from experiments.frontier.programs import Programs, Timed, run_times, summarize
@@ -19,7 +20,15 @@ from experiments.frontier.shading_method import SHADING_METHODS
 from experiments.frontier.shadow_method import Passes, biases
 from experiments.frontier.view import load_view
 from experiments.options import techniques
-from shadows import DirectionalLight, Filter, PointLight
+from shadows import (
+    DirectionalLight,
+    DiscLight,
+    Filter,
+    PointLight,
+    Projector,
+    RectangleLight,
+    SpotLight,
+)
 
 QUICK = methods(("bilinear", "vsm"), quick=True)[:3]  # two of them with the smaller map
 
@@ -139,6 +148,37 @@ def test_an_area_light_is_judged_softly():
         found, _ = method.accuracy(view, Programs())
         assert 0 < found["rmse"] < found["rmse_penumbra"]
     assert ((view.share > 0) & (view.share < 1)).any()
+
+
+# Lights of every kind in one form
+
+_PLACE, _WAY = np.float32([0.3, 2.0, -0.5]), np.float32([0.6, -0.8, 0.0])
+_COLOR = np.float32([1.0, 0.8, 0.5])
+LIGHTS = [
+    DirectionalLight(-_WAY, _COLOR),
+    PointLight(_PLACE, _COLOR),
+    SpotLight(_PLACE, _WAY, 0.2, 0.7, _COLOR),
+    SpotLight(_PLACE, _WAY, 0.5, 0.5, _COLOR),
+    DiscLight(_PLACE, _WAY, 0.2, _COLOR),
+    RectangleLight(_PLACE, _WAY, 0.2, 0.4, color=_COLOR),
+]
+
+
+@pytest.mark.parametrize("light", LIGHTS, ids=lambda light: type(light).__name__)
+def test_a_light_s_form_shines_as_it_does(light):
+    positions = jax.random.normal(jax.random.key(0), (1000, 3)) * 2
+    form = light_form(light)
+    assert type(form) is LightForm
+    for name in ("to_light", "radiance"):
+        whole, formed = (np.asarray(getattr(one, name)(positions)) for one in (light, form))
+        np.testing.assert_allclose(formed, whole, atol=2e-6)  # measured 6e-7
+
+
+def test_all_forms_share_a_program():
+    assert len({jax.tree.structure(light_form(light)) for light in LIGHTS}) == 1
+    image = np.ones((2, 2, 3), np.float32)
+    projector = Projector(_PLACE, _WAY, image)
+    assert light_form(projector) is projector
 
 
 # Gradients

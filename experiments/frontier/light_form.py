@@ -5,10 +5,12 @@ from typing import Any, cast
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from shadows.area_lights import AreaLight
+from shadows.area_lights import AreaLight, DiscLight, RectangleLight
 from shadows.lights import DirectionalLight, Light, PointLight, Points, SpotLight
 from shadows.transforms import Scalar, Vector
 from tangentspace._math import dot, safe_normalize
+
+_KINDS = (DirectionalLight, PointLight, SpotLight, DiscLight, RectangleLight)  # and none below them
 
 
 class LightForm(Light):
@@ -52,15 +54,15 @@ def light_form(light: Light) -> Light:
     Args:
         light: A filter's numbers that depend on its kind must have been taken from it before.
     """
+    if type(light) not in _KINDS:
+        return light
     any_light = cast(Any, light)
     color = jnp.asarray(any_light.color)
     axis, gain, offset, squared = jnp.zeros_like(color), 0.0, 1.0, 0.0
     if isinstance(light, DirectionalLight):
         place = jnp.append(jnp.asarray(light.direction), 0.0)
-    elif isinstance(light, PointLight | SpotLight | AreaLight):
-        place = jnp.append(jnp.asarray(any_light.position), 1.0)
     else:
-        return light
+        place = jnp.append(jnp.asarray(any_light.position), 1.0)
     if isinstance(light, AreaLight):
         axis, gain, offset = safe_normalize(light.direction), 1.0, 0.0
     if isinstance(light, SpotLight):
