@@ -41,7 +41,7 @@ def _run(arguments: Sequence[str]) -> int:
     from .normal_map_fits.fit_normal_map_command import fit as fit_normal_map
     from .rendering.render_command import render
     from .simplest.command import simplest
-    from .simplest.search import OutOfReach
+    from .simplest.find import OutOfReach
     from .stability.command import stability
 
     commands = {

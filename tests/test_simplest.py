@@ -20,8 +20,9 @@ from experiments.rendering.render_scene import render_scene
 from experiments.scenes import load_scene
 from experiments.simplest.bench import Measured, stages
 from experiments.simplest.climb import Expected, Found, climb, covariance
+from experiments.simplest.find import out_of_reach, simplest
 from experiments.simplest.models import Model, all_models, bias_words, biases_for, filters
-from experiments.simplest.search import Search, out_of_reach, simplest
+from experiments.simplest.search import Search
 from experiments.simplest.sight import look_at_scene, picture_of, shown
 from experiments.simplest.theory import Theory
 from experiments.technique_words import parse_bias

@@ -13,6 +13,7 @@ from ..files.images import atomic_path
 from ..provenance import commit, device, versions
 from ..rendering.render_command import SceneName
 from ..scenes import load_scene
+from .find import simplest as find
 from .report import (
     FLAT_MAP,
     content,
@@ -21,7 +22,6 @@ from .report import (
     save_comparison,
     write_flat_map,
 )
-from .search import simplest as find
 from .sight import Measure
 
 

@@ -13,8 +13,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from ..console import say, say_table
 from ..files.images import atomic_path, write_exr
 from .choice import choose
+from .find import Simplest
 from .models import LOOKS
-from .search import Simplest, Tried
+from .search import Tried
 from .sight import Picture, shown
 
 FLAT_MAP = "flat_normals.exr"
