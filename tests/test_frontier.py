@@ -140,6 +140,16 @@ def test_programs_are_compiled_once(view, programs):
     assert len(programs._kept) == before
 
 
+def test_the_last_programs_are_kept(monkeypatch):
+    """As many as a process can hold; the one that was asked for longest ago goes first."""
+    monkeypatch.setattr(programs_module, "_MOST_KEPT", 2)
+    programs, made = Programs(), []
+    for name in "abacab":
+        programs.get(name, lambda x, name=name: made.append(name) or x, 1.0)
+    assert "".join(made) == "abcb"
+    assert len(programs) == 2
+
+
 def test_an_area_light_is_judged_softly():
     view = load_view("soft-lamp", 32)
     assert view.soft

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import experiments.simplest.command as command
+import experiments.simplest.evidence as evidence
 import experiments.simplest.models as models
 from experiments.__main__ import main
 from experiments.files.images import read_exr
@@ -445,3 +446,37 @@ def test_bad_input_is_one_line_and_exit_code_2(arguments, said, monkeypatch, cap
     assert len(lines) == 1
     assert said in lines[0]
     assert not (tmp_path / "out").exists()
+
+
+# Evidence
+
+
+def test_one_model_for_all():
+    """By hand: of those that are enough on most scenes, the cheapest."""
+    a, b, c, d = (Model("plain", name, 256, "slope") for name in "abcd")
+    table = {a: (0.1, 0.3, 0.1, 1), b: (0.1, 0.1, 0.4, 3), c: (0.1, 0.2, 0.2, 2), d: (0.3, 0, 0, 1)}
+    scenes = [
+        {m: Measured(row[k], {("draw",): float(row[3])}) for m, row in table.items()}
+        for k in range(3)
+    ]
+    del scenes[2][d]  # not of all scenes
+    found = evidence.one_for_all(scenes, 0.2)
+    assert found == {
+        "tolerance": 0.2, "model": c.name, "enough": 3, "scenes": 3, "median_ms": 2.0,
+        "median_error": 0.2, "worst_error": 0.2,
+    }  # fmt: skip
+    assert evidence.one_for_all(scenes, 0.15)["model"] == a.name  # two, and cheaper than b
+
+
+def test_evidence_goes_on_where_it_was(tmp_path, monkeypatch, capsys):
+    few = [Model("plain"), Model("plain", "nearest", 128, "slope")]
+    monkeypatch.setattr(evidence, "all_models", lambda *of_scene: few)
+    asked = {"out": tmp_path, "scenes": ("default",), "only": True, "image_size": 16, "runs": 1}
+    evidence.evidence(**asked)
+    first = json.loads((tmp_path / "evidence.json").read_text())
+    assert len(first["rows"]) == len(first["one_for_all"]) == len(evidence.TOLERANCES)
+    assert {row["models"] for row in first["rows"]} == {2}
+    assert "one model for all scenes" in capsys.readouterr().out
+    monkeypatch.setattr(evidence.Bench, "measure", None)  # nothing is measured again
+    evidence.evidence(**asked)
+    assert json.loads((tmp_path / "evidence.json").read_text()) == first

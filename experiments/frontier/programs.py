@@ -13,19 +13,22 @@ import numpy as np
 _LITTLE_S, _MUCH_S = 0.03, 0.4  # spent on a stage: more runs if below, fewer if above
 _MOST, _LEAST = 50, 2
 _SLOW_S = 0.1  # a program so slow needs no warming
+_MOST_KEPT = 450  # a program takes 60 to 100 of the 65 530 maps that a process may have
 _OF_IMAGE = ("draw", "prepare", "image")  # stages that make an image
 
 
 class Programs:
     """Compiled programs by what they are made of, with what compiling them took.
 
-    Several threads may ask: each program is compiled by one, and different ones side by side.
+    The last ones are kept. Several threads may ask: each program is compiled by one, and
+    different ones side by side.
     """
 
     def __init__(self) -> None:
         """Begin with none."""
         self._kept: dict[tuple, tuple[Any, dict[str, Any]]] = {}
         self._compiling: dict[tuple, threading.Lock] = defaultdict(threading.Lock)
+        self._keeping = threading.Lock()
 
     def get(self, name: str, function: Callable, *arguments: Any) -> "Timed":
         """Return a program bound to its arguments; compiled if it is new.
@@ -39,9 +42,15 @@ class Programs:
         leaves, tree = jax.tree.flatten(arguments)
         key = (name, tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves))
         with self._compiling[key]:
-            if key not in self._kept:
-                self._kept[key] = _compiled(function, arguments)
-        return Timed(*self._kept[key], arguments)
+            with self._keeping:
+                found = self._kept.pop(key, None)
+            if found is None:
+                found = _compiled(function, arguments)
+            with self._keeping:
+                self._kept[key] = found  # the last of them
+                while len(self._kept) > _MOST_KEPT:
+                    del self._kept[next(iter(self._kept))]
+        return Timed(*found, arguments)
 
     def __len__(self) -> int:
         """How many were compiled."""

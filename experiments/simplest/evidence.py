@@ -3,6 +3,9 @@
 On each scene every model is measured once; then the search runs on these measurements, so that
 both judge by the same errors and times, for several tolerances. Run it on an idle machine; a run
 that was stopped goes on in its folder with the next scene.
+
+The same measurements say which single model serves most scenes: what ``render`` does if it is
+told nothing.
 """
 
 import json
@@ -32,7 +35,6 @@ SCENES = (
     "mirror", "shadowed-relief", "spot", "projector", "room", "soft-lamp", "tall-and-short",
 )  # fmt: skip
 TOLERANCES = (0.05, 0.02, 0.01, 0.005, 0.0025)
-_MOST_PROGRAMS = 1500  # a process may map only so much
 
 
 def evidence(
@@ -54,9 +56,8 @@ def evidence(
     check_folder(out)
     make_folder(out)
     store, programs, rows = Store(out), Programs(), []
+    found_on: dict[str, dict[str, dict[Model, Measured]]] = {"hard": {}, "area": {}}
     for name in (*(() if only else SCENES), *scenes):
-        if len(programs) > _MOST_PROGRAMS:
-            programs = Programs()
         with stage(name) as tell:
             sight = look_at_scene(load_scene(name), image_size)
             theory = Theory(sight, measure)
@@ -68,14 +69,24 @@ def evidence(
                 store.put(key, dict(_measure_all(bench, models, tell)))
                 found = store.get(key) or {}
             measured = {m: _told(found[m.name]) for m in models}
+            found_on["area" if theory.soft else "hard"][Path(name).name] = {
+                m._replace(look=sight.looks[0]): of_m for m, of_m in measured.items()
+                if m.look == sight.looks[-1]
+            }  # fmt: skip
             for tolerance in TOLERANCES:
                 search = Search(sight, theory, models, measure)
-                rows.append({"scene": name} | compare(search, measured, tolerance))
-        made_with = {"versions": versions(), "device": device(), "commit": commit()}
-        what = {"rows": rows, "measure": measure, "image_size": image_size}
-        with atomic_path(out / "evidence.json") as temporary:
-            temporary.write_text(json.dumps(what | made_with, indent=1) + "\n", "utf-8")
+                rows.append({"scene": Path(name).name} | compare(search, measured, tolerance))
+    alone = [
+        {"light": light} | one_for_all(list(scenes.values()), tolerance)
+        for light, scenes in found_on.items() if scenes
+        for tolerance in TOLERANCES
+    ]  # fmt: skip
+    made_with = {"versions": versions(), "device": device(), "commit": commit()}
+    what = {"rows": rows, "one_for_all": alone, "measure": measure, "image_size": image_size}
+    with atomic_path(out / "evidence.json") as temporary:
+        temporary.write_text(json.dumps(what | made_with, indent=1) + "\n", "utf-8")
     _print(rows)
+    _print_alone(alone)
 
 
 def _measure_all(
@@ -88,7 +99,7 @@ def _measure_all(
         yield model.name, (error, list(ms.items()))
 
 
-def _told(found: tuple[float, list]) -> Measured:
+def _told(found: Sequence) -> Measured:
     error, ms = found
     return Measured(error, {tuple(stage): time for stage, time in ms})
 
@@ -109,6 +120,29 @@ def compare(search: Search, measured: Mapping[Model, Measured], tolerance: float
         "ratio": _ratio(mine, cheapest, measured),
         "tried": len(search.tried),
         "models": len(measured),
+    }
+
+
+def one_for_all(scenes: Sequence[Mapping[Model, Measured]], tolerance: float) -> dict[str, Any]:
+    """Return the model that is enough on most scenes, the cheapest of those.
+
+    Args:
+        scenes: What was measured on each, of the same models or more.
+        tolerance: Largest error.
+    """
+    shared = [m for m in scenes[0] if all(m in scene for scene in scenes)]
+    errors = np.array([[scene[m].error for scene in scenes] for m in shared])
+    costs = np.array([[scene[m].cost for scene in scenes] for m in shared])
+    enough, cost = np.sum(errors <= tolerance, axis=1), np.median(costs, axis=1)
+    best = int(np.lexsort((cost, -enough))[0])
+    return {
+        "tolerance": tolerance,
+        "model": shared[best].name,
+        "enough": int(enough[best]),
+        "scenes": len(scenes),
+        "median_ms": float(cost[best]),
+        "median_error": float(np.median(errors[best])),
+        "worst_error": float(errors[best].max()),
     }
 
 
@@ -145,6 +179,21 @@ def _print(rows: list[dict[str, Any]]) -> None:
             ["choices that miss the tolerance", str(missed)],
         ],
     )
+
+
+def _print_alone(rows: list[dict[str, Any]]) -> None:
+    say_table(
+        "one model for all scenes",
+        ["light", "tolerance", "model", "enough on", "median ms", "median error", "worst"],
+        [
+            [
+                row["light"], f"{row['tolerance']:g}", row["model"],
+                f"{row['enough']} of {row['scenes']}", f"{row['median_ms']:.1f}",
+                f"{row['median_error']:.4f}", f"{row['worst_error']:.4f}",
+            ]
+            for row in rows
+        ],
+    )  # fmt: skip
 
 
 def _number(value: float | None) -> str:

@@ -57,7 +57,7 @@ class Theory:
             measure: Of errors.
         """
         self._measure: Measure = measure
-        self._soft = any(isinstance(seen.light, AreaLight) for seen in sight.seen)
+        self.soft = any(isinstance(seen.light, AreaLight) for seen in sight.seen)
         self._pixels = [shadow_pixels(sight, k) for k in range(len(sight.seen))]
         self._sight = sight
         self._parts: dict[Model, Parts] = {}
@@ -87,7 +87,7 @@ class Theory:
 
     def useless(self, model: Model) -> str | None:
         """Return why a model cannot be the least one whatever its error, if it cannot."""
-        if model.filter.startswith("pcss") and not self._soft:
+        if model.filter.startswith("pcss") and not self.soft:
             return "no light has a size: shadows are not soft"
         return None
 
@@ -115,7 +115,7 @@ class Theory:
             left = np.where(need > given, 1 - given / np.where(need > 0, need, 1), 0) / 2
             acne = left * whole if reach < 1 else self._penalty(pixels, left)
         leaks = (pixels.share < 0.5) & (pixels.gap < given * texel)
-        softens = isinstance(filter, PCSSFilter) and self._soft
+        softens = isinstance(filter, PCSSFilter) and self.soft
         key = index, model.map_size, "soft" if softens else reach
         if key not in self._edges_of:
             edges = self._soft_edges if softens else self._edges
