@@ -105,6 +105,12 @@ def surface_visibility(
     return jnp.where(facing & surface.covered, visibility, 0.0)
 
 
+def facing_visibility(surface: Surface, light: Light) -> Visibility:
+    """Return a light's visibility at each pixel if nothing blocks it: 1 on faces turned to it."""
+    facing = dot(surface.face_normal, light.to_light(surface.position)) > 0
+    return (facing & surface.covered).astype(surface.position.dtype)
+
+
 def default_bias(filter: Filter) -> Bias:
     """Return the least bias that clears every plane of acne under a filter.
 
@@ -196,6 +202,7 @@ def render(
     shading: Shading = BlinnPhongShading(),
     shadow_maps: Sequence[ShadowMap] | None = None,
     volume_edges: MeshEdges | None = None,
+    cast_shadows: bool = True,
 ) -> Rendering:
     """Render a mesh under its lights, with a shadow map for each.
 
@@ -220,6 +227,7 @@ def render(
         shadow_maps: Maps kept from before, while only the eye or a bias moved.
         volume_edges: ``mesh_edges(mesh.positions, mesh.faces)``, to cast shadows by volumes
             instead of maps, of which none is drawn then; None for maps.
+        cast_shadows: Whether anything blocks light; if not, no map is drawn either.
 
     Raises:
         ValueError: If there is no light, not one kept map for each light, or the mesh lacks
@@ -231,7 +239,7 @@ def render(
     lights = (lights,) if isinstance(lights, Light) else tuple(lights)
     bias = default_bias(filter) if bias is None else bias
     check_techniques(bias, filter)
-    if volume_edges is not None:
+    if volume_edges is not None or not cast_shadows:
         shadow_maps = ()
     elif shadow_maps is None:
         reach, aspect = filter.reach(), image_size[1] / image_size[0]
@@ -251,7 +259,9 @@ def render(
         expected = f"expected one of `shadow_maps` for each of {len(lights)} lights"
         raise ValueError(f"render: {expected}, got {len(shadow_maps)}")
     surface = render_surface(mesh, camera, image_size=image_size)
-    if volume_edges is not None:
+    if not cast_shadows:
+        visibilities = tuple(facing_visibility(surface, light) for light in lights)
+    elif volume_edges is not None:
         visibilities = tuple(
             volume_visibility(mesh, camera, surface, light, edges=volume_edges) for light in lights
         )

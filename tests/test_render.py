@@ -103,6 +103,22 @@ def sure_shadow(surface, light, margin):
 # Known answers
 
 
+def test_nothing_blocks_light_without_shadows():
+    bare = quick(
+        lambda mesh, camera, light: render(
+            mesh, camera, light, image_size=IMAGE, map_size=MAP, cast_shadows=False
+        )
+    )(MESH, CAMERA, SUN)
+    surface = bare.surface
+    cosine = np.asarray(surface.face_normal) @ SUN.direction
+    lit = np.asarray(surface.covered) & (cosine > 0)
+    assert bare.shadow_maps == ()
+    np.testing.assert_array_equal(bare.visibilities[0], lit)
+    shadowed = np.asarray(draw(MESH, CAMERA, SUN).visibilities[0])
+    assert (shadowed <= lit).all()
+    assert np.mean(lit & (shadowed == 0)) > 0.02  # the box casts one
+
+
 @pytest.mark.parametrize("name", LIGHTS)
 def test_shadow_falls_where_geometry_says(name):
     surface, shadow_map = stages(MESH, CAMERA, LIGHTS[name])

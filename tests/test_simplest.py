@@ -20,6 +20,7 @@ from experiments.files.images import read_exr
 from experiments.rendering.render_scene import render_scene
 from experiments.scenes import load_scene
 from experiments.simplest.bench import Measured, stages
+from experiments.simplest.choice import choose
 from experiments.simplest.climb import Expected, Found, climb, covariance
 from experiments.simplest.find import out_of_reach, simplest
 from experiments.simplest.models import Model, all_models, bias_words, biases_for, filters
@@ -375,6 +376,22 @@ def test_the_words_show_the_reported_picture(scene, found, plain, monkeypatch, c
         color = np.stack([read_exr(image)[channel] for channel in "RGB"], axis=-1)
     same = result.sight.error(shown(color), "rmse")
     assert same == pytest.approx(content["choice"]["error"], abs=1e-7)
+
+
+def test_without_shadows_or_normal_map_in_words(monkeypatch, capsys, tmp_path):
+    sight = look_at_scene(load_scene("bumpy"), SIZE)
+    least = choose(Model("plain"), sight, 1.0)
+    words = least.arguments(sight.looks)
+    assert words == ["--shadows", "none", "--normal-map", "none"]
+    asked = ("bumpy", "--image-size", SIZE, SIZE, *words, "--out", tmp_path / "image.exr")
+    assert run(monkeypatch, capsys, "render", *asked)[0] == 0
+    channels = read_exr(tmp_path / "image.exr")
+    color = np.stack([channels[channel] for channel in "RGB"], axis=-1)
+    image = least.render(load_scene("bumpy"), SIZE)
+    np.testing.assert_array_equal(color, image.color)
+    np.testing.assert_array_equal(channels["visibility.V"], sight.seen[0].facing)
+    expected = picture_of(sight, "plain", [sight.seen[0].facing])
+    np.testing.assert_array_equal(shown(color), expected)
 
 
 def test_the_choice_is_what_render_takes(found):

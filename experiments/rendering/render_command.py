@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 import tyro
@@ -31,8 +31,8 @@ from ..technique_words import (
     parse_shading,
 )
 from .prepare_scene import prepare_scene
-from .render_scene import render_light_map, render_scene
-from .scene_maps import with_maps
+from .render_scene import Shadows, render_light_map, render_scene
+from .scene_maps import with_maps, without_normal_maps
 
 SceneName = Annotated[
     str,
@@ -74,8 +74,8 @@ def render(
     filter: FilterWords = (),
     shading: ShadingWords = ("blinn-phong",),
     shadows: Annotated[
-        Literal["maps", "volumes"],
-        tyro.conf.arg(help="Shadow maps, or shadow volumes: exact and hard, without a map."),
+        Shadows,
+        tyro.conf.arg(help="Shadow maps; shadow volumes: exact and hard, without a map; or none."),
     ] = "maps",
     mist: Annotated[
         float,
@@ -92,7 +92,14 @@ def render(
             help_behavior_hint="",
         ),
     ] = None,
-    normal_map: MapFile = None,
+    normal_map: Annotated[
+        Path | None,
+        tyro.conf.arg(
+            metavar="IMAGE",
+            help="Map on the surface, .png or .exr, by its uvs; 'none' leaves out the scene's own.",
+            help_behavior_hint="(default: the scene's own)",
+        ),
+    ] = None,
     flip_green: Annotated[
         bool, tyro.conf.arg(help="The normal map's green points down (-Y, as DirectX has it).")
     ] = False,
@@ -151,18 +158,19 @@ def render(
         "bias": bias is not None, "compare": compare, "filter": filter,
         "layout": layout, "shadow-map-out": shadow_map_out, "mist": mist,
     }  # fmt: skip
-    if shadows == "volumes":
-        _refuse(asked, "--shadows volumes")
+    if shadows != "maps":
+        _refuse(asked, f"--shadows {shadows}")
     if light_map is not None:
-        more = {"environment": environment, "shadows": shadows == "volumes"}
+        more = {"environment": environment, "shadows": shadows != "maps"}
         _refuse(asked | more, "--light-map")
-    if flip_green and normal_map is None:
+    smooth = normal_map == Path("none")
+    if flip_green and (smooth or normal_map is None):
         raise ValueError("--flip-green: is for --normal-map, which is not given; drop it")
     with stage(f"loading {scene}"):
         loaded = with_maps(
-            load_scene(scene),
+            without_normal_maps(load_scene(scene)) if smooth else load_scene(scene),
             color_map=color_map,
-            normal_map=normal_map,
+            normal_map=None if smooth else normal_map,
             flip_green=flip_green,
             height_map=height_map,
             height_scale=height_scale,
@@ -189,7 +197,7 @@ def render(
                 compare=comparison,
                 shading=model,
                 layout=maps,
-                volumes=shadows == "volumes",
+                shadows=shadows,
                 medium=Medium(mist) if mist else None,
             )
     for shadow_map in image.shadow_maps:

@@ -1,6 +1,7 @@
 """Render a ``Scene``: the one place where experiments compile ``shadows.render``."""
 
 from collections.abc import Sequence
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -24,6 +25,8 @@ from tangentspace.shading import Shading
 
 from ..scene import Scene
 
+Shadows = Literal["maps", "volumes", "none"]
+
 
 def render_scene(
     scene: Scene,
@@ -35,7 +38,7 @@ def render_scene(
     compare: Compare,
     shading: Shading,
     layout: Layout = SingleLayout(),
-    volumes: bool = False,
+    shadows: Shadows = "maps",
     medium: Medium | None = None,
 ) -> Rendering:
     """Render a scene under all its lights; compiled once per set of sizes and techniques.
@@ -49,14 +52,15 @@ def render_scene(
         compare: Hard or soft; for filters that compare.
         shading: The lighting model.
         layout: How many maps serve each light.
-        volumes: Cast shadows by volumes instead of maps.
+        shadows: Cast by maps, by volumes, or not at all.
         medium: Fills the space before the eye, and shows the light's shafts.
     """
+    volumes = shadows == "volumes"
     edges = mesh_edges(scene.mesh.positions, scene.mesh.faces) if volumes else None
     look = (scene.materials, scene.face_materials, scene.environment)
     arrays = (scene.mesh, scene.camera, scene.lights, look, bias, filter, compare, shading, layout)
     arrays += (edges, medium)
-    static = (image_size, map_size)
+    static = (image_size, map_size, shadows != "none")
     return jax.block_until_ready(_render(jax.tree.map(jnp.asarray, arrays), static))
 
 
@@ -103,7 +107,7 @@ def shade_scene(
 def _render(arrays: tuple, static: tuple) -> Rendering:
     mesh, camera, lights, look, bias, filter, compare, shading, layout, edges, medium = arrays
     materials, face_materials, environment = look
-    image_size, map_size = static
+    image_size, map_size, cast_shadows = static
     image = render(
         mesh,
         camera,
@@ -119,6 +123,7 @@ def _render(arrays: tuple, static: tuple) -> Rendering:
         environment=environment,
         shading=shading,
         volume_edges=edges,
+        cast_shadows=cast_shadows,
     )
     if medium is None:
         return image

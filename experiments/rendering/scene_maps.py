@@ -74,5 +74,11 @@ def with_maps(
     return scene._replace(notes=(*scene.notes, *notes))
 
 
+def without_normal_maps(scene: Scene) -> Scene:
+    """Return the scene with the normals of its mesh alone."""
+    bare = (dataclasses.replace(m, normal_texture=None, normal_scale=None) for m in scene.materials)
+    return scene._replace(materials=tuple(bare))
+
+
 def _dressed(material: Material, changes: dict) -> Material:
     return material if material is FLOOR else dataclasses.replace(material, **changes)

@@ -3,21 +3,15 @@
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from shadows.layouts import Layout
 from shadows.render import Rendering
 
 from ..rendering.prepare_scene import prepare_scene
-from ..rendering.render_scene import render_scene
+from ..rendering.render_scene import Shadows, render_scene
 from ..scene import Scene
 from ..technique_words import parse_bias, parse_lookup
 from .models import Model, bias_words, filters
 from .sight import SHADING, Sight, with_look
-
-# Without shadows in the words of ``render``, which always draws a map: nothing blocks where
-# every point counts as at the light.
-_SMALLEST = 16
 
 
 class Choice(NamedTuple):
@@ -25,7 +19,7 @@ class Choice(NamedTuple):
 
     Attributes:
         look: ``plain`` where normal maps are left out.
-        map_size: Texels on each side.
+        map_size: Texels on each side; 0 where nothing casts shadows.
         filter: Words of ``--filter``.
         bias: Words of ``--bias``.
         layout: How many maps serve each light; the least that does, as ``render`` chooses it.
@@ -38,6 +32,11 @@ class Choice(NamedTuple):
     layout: Layout
 
     @property
+    def shadows(self) -> Shadows:
+        """What casts them."""
+        return "maps" if self.map_size else "none"
+
+    @property
     def techniques(self) -> dict[str, Any]:
         """What ``render_scene`` takes beside the scene and the size of the image."""
         filter, compare = parse_lookup(self.filter, ())
@@ -48,6 +47,7 @@ class Choice(NamedTuple):
             "bias": parse_bias(self.bias, filter),
             "layout": self.layout,
             "shading": SHADING,
+            "shadows": self.shadows,
         }
 
     def scene(self, scene: Scene) -> Scene:
@@ -59,15 +59,17 @@ class Choice(NamedTuple):
         size = (image_size, image_size)
         return render_scene(self.scene(scene), image_size=size, **self.techniques)
 
-    def arguments(self, flat_map: str | None = None) -> list[str]:
+    def arguments(self, looks: Sequence[str]) -> list[str]:
         """Return the options with which the command ``render`` shows the same.
 
         Args:
-            flat_map: File of a flat normal map, where the choice leaves the scene's own out.
+            looks: Those that the scene has.
         """
         words = ["--shadow-map-size", str(self.map_size), "--filter", *self.filter]
         words += ["--bias", *self.bias]
-        return [*words, "--normal-map", flat_map] if flat_map else words
+        if self.shadows == "none":
+            words = ["--shadows", "none"]
+        return words if self.look == looks[-1] else [*words, "--normal-map", "none"]
 
 
 def choose(model: Model, sight: Sight, slope: float) -> Choice:
@@ -79,16 +81,7 @@ def choose(model: Model, sight: Sight, slope: float) -> Choice:
         slope: Of the constant bias, see ``bias_words``.
     """
     if not model.filter:
-        beyond = f"constant={10 * np.ceil(_extent(sight)):g}"
-        return Choice(model.look, _SMALLEST, ("nearest",), (beyond,), sight.layout)
+        return Choice(model.look, 0, ("nearest",), (), sight.layout)
     words: Sequence[str] = filters()[model.filter].words
     bias = bias_words(model.bias, slope)
     return Choice(model.look, model.map_size, tuple(words), bias, sight.layout)
-
-
-def _extent(sight: Sight) -> float:
-    """Return the greatest length that a shadow ray may have."""
-    points = [np.asarray(sight.scene.mesh.positions)]
-    sources = [getattr(seen.light, "position", None) for seen in sight.seen]
-    points += [np.asarray(source)[None] for source in sources if source is not None]
-    return float(np.linalg.norm(np.ptp(np.concatenate(points), axis=0)))

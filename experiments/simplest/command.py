@@ -15,12 +15,9 @@ from ..rendering.render_command import SceneName
 from ..scenes import load_scene
 from .find import simplest as find
 from .report import (
-    FLAT_MAP,
     content,
-    needs_flat_map,
     print_result,
     save_comparison,
-    write_flat_map,
 )
 from .sight import Measure
 
@@ -82,9 +79,7 @@ def simplest(
             techniques=techniques, budget_ms=np.inf if budget_ms is None else budget_ms,
         )  # fmt: skip
     make_folder(out)
-    if needs_flat_map(found):
-        write_flat_map(out / FLAT_MAP)
-    result: dict[str, Any] = content(found, scene, image_size, out) | {"budget_ms": budget_ms}
+    result: dict[str, Any] = content(found, scene, image_size) | {"budget_ms": budget_ms}
     made_with = {"versions": versions(), "device": device(), "commit": commit()}
     with atomic_path(out / "simplest.json") as temporary:
         temporary.write_text(json.dumps(result | made_with, indent=1) + "\n", "utf-8")

@@ -11,14 +11,12 @@ from jaxtyping import Float
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from ..console import say, say_table
-from ..files.images import atomic_path, write_exr
+from ..files.images import atomic_path
 from .choice import choose
 from .find import Simplest
-from .models import LOOKS
 from .search import Tried
 from .sight import Picture, shown
 
-FLAT_MAP = "flat_normals.exr"
 _BACKGROUND = 0.93  # as shown, where there is no surface
 _UNITS = {
     "rmse": "RMSE of the shown picture",
@@ -27,18 +25,16 @@ _UNITS = {
 }
 
 
-def content(found: Simplest, scene: str, image_size: int, out: Path) -> dict[str, Any]:
+def content(found: Simplest, scene: str, image_size: int) -> dict[str, Any]:
     """Return what simplest.json holds.
 
     Args:
         found: The least model.
         scene: As ``render`` takes it.
         image_size: Pixels on each side.
-        out: The folder.
     """
-    flat = str(out / FLAT_MAP) if needs_flat_map(found) else None
     words = [scene, "--image-size", str(image_size), str(image_size)]
-    words += found.choice.arguments(flat)
+    words += found.choice.arguments(found.sight.looks)
     command = shlex.join(["python", "-m", "experiments", "render", *words, "--out", "image.exr"])
     return {
         "scene": scene,
@@ -56,17 +52,6 @@ def content(found: Simplest, scene: str, image_size: int, out: Path) -> dict[str
         "skipped": [{"model": m.name, "because": why} for m, why in found.skipped.items()],
         "models": len(found.tried) + len(found.skipped),
     }
-
-
-def needs_flat_map(found: Simplest) -> bool:
-    """Tell whether the command ``render`` has to be told to leave normal maps out."""
-    return len(found.sight.looks) > 1 and found.model.look == LOOKS[0]
-
-
-def write_flat_map(path: Path) -> None:
-    """Write a normal map of one texel that changes no normal."""
-    texel = {"R": 0.5, "G": 0.5, "B": 1.0}
-    write_exr(path, {name: np.full((1, 1), v, np.float32) for name, v in texel.items()})
 
 
 def print_result(found: Simplest) -> None:

@@ -4,7 +4,6 @@ Truth is the picture under the share of each light that rays find, with normal m
 mips where the scene has them. Every model is judged by its picture, as a screen shows it.
 """
 
-import dataclasses
 import functools
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
@@ -29,6 +28,7 @@ from tangentspace.shading import BlinnPhongShading
 from ..checks import check_scene
 from ..files.images import linear_to_srgb
 from ..rendering.prepare_scene import prepare_scene
+from ..rendering.scene_maps import without_normal_maps
 from ..scene import Scene
 from ..technique_words import choose_layout
 from ..truth.area import surface_share
@@ -139,10 +139,7 @@ def shown(color: Float[np.ndarray, "height width 3"]) -> Picture:
 
 def with_look(scene: Scene, look: str) -> Scene:
     """Return the scene with a look."""
-    if look == LOOKS[-1]:
-        return scene
-    bare = (dataclasses.replace(m, normal_texture=None, normal_scale=None) for m in scene.materials)
-    return scene._replace(materials=tuple(bare))
+    return scene if look == LOOKS[-1] else without_normal_maps(scene)
 
 
 def shading_arguments(sight: Sight, look: str) -> tuple[Any, ...]:
