@@ -13,15 +13,15 @@ import numpy as np
 _LITTLE_S, _MUCH_S = 0.03, 0.4  # spent on a stage: more runs if below, fewer if above
 _MOST, _LEAST = 50, 2
 _SLOW_S = 0.1  # a program so slow needs no warming
-_MOST_KEPT = 450  # a program takes 60 to 100 of the 65 530 maps that a process may have
+_MOST_MAPS = 40_000  # of memory; Linux allows a process 65 530, and a program takes 60 to 200
 _OF_IMAGE = ("draw", "prepare", "image")  # stages that make an image
 
 
 class Programs:
     """Compiled programs by what they are made of, with what compiling them took.
 
-    The last ones are kept. Several threads may ask: each program is compiled by one, and
-    different ones side by side.
+    The last ones are kept, as many as a process can hold. Several threads may ask: each program
+    is compiled by one, and different ones side by side.
     """
 
     def __init__(self) -> None:
@@ -44,17 +44,28 @@ class Programs:
         with self._compiling[key]:
             with self._keeping:
                 found = self._kept.pop(key, None)
+            new = found is None
             if found is None:
                 found = _compiled(function, arguments)
             with self._keeping:
                 self._kept[key] = found  # the last of them
-                while len(self._kept) > _MOST_KEPT:
-                    del self._kept[next(iter(self._kept))]
+                if new and _crowded():
+                    for old in list(self._kept)[: len(self._kept) // 2]:
+                        del self._kept[old]
         return Timed(*found, arguments)
 
     def __len__(self) -> int:
         """How many were compiled."""
         return len(self._kept)
+
+
+def _crowded() -> bool:
+    """Tell whether this process has nearly as many maps of memory as it may have."""
+    try:
+        with open("/proc/self/maps", "rb") as maps:
+            return sum(1 for _ in maps) > _MOST_MAPS
+    except OSError:  # not on Linux, where there is no such limit
+        return False
 
 
 def _compiled(function: Callable, arguments: tuple) -> tuple[Any, dict[str, Any]]:

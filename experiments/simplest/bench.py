@@ -82,6 +82,7 @@ class Bench:
         self._measure: Measure = measure
         self._runs, self._programs = runs, programs
         self._ms: dict[Stage, float] = {}
+        self._maps: dict[tuple[Stage, int], _Map] = {}  # of the last filter and size
 
     def measure(self, model: Model) -> Measured:
         """Return a model's error and time."""
@@ -98,9 +99,9 @@ class Bench:
         """Return a model's picture, and for each stage its program for each light."""
         timed: dict[Stage, list[Timed]] = {stage: [] for stage in stages(model)}
         visibilities = []
-        for seen in self.sight.seen:
+        for index, seen in enumerate(self.sight.seen):
             if model.filter:
-                visibilities.append(self._shadow(model, seen.light, timed))
+                visibilities.append(self._shadow(model, index, timed))
             else:
                 visibilities.append(jnp.asarray(seen.facing, jnp.float32))
         arguments = (*shading_arguments(self.sight, model.look), tuple(visibilities))
@@ -108,29 +109,47 @@ class Bench:
         timed[("shade", model.look)] = [shade]
         return shown(np.asarray(shade())), timed
 
-    def _shadow(self, model: Model, light: Light, timed: dict[Stage, list[Timed]]) -> Array:
+    def _shadow(self, model: Model, index: int, timed: dict[Stage, list[Timed]]) -> Array:
         """Return a light's visibility under a model, and note the programs that made it."""
         draw_stage, prepare_stage, look_up_stage, _ = stages(model)
+        key = prepare_stage, index
+        if key not in self._maps:
+            self._maps = {of: made for of, made in self._maps.items() if of[0] == prepare_stage}
+            self._maps[key] = self._map(model, index)
+        made, light = self._maps[key], self.sight.seen[index].light
         filter, bias = techniques(model, self.slope)
-        filter = filter.for_light(light)
-        scene = self.sight.scene
+        look_up = self._programs.get(
+            f"simplest look up {model.filter} {model.map_size}", _look_up,
+            bias, filter.for_light(light), light, self.sight.surface, made.drawn, made.prepared,
+        )  # fmt: skip
+        for stage, program in (
+            (draw_stage, made.draw), (prepare_stage, made.prepare), (look_up_stage, look_up)
+        ):  # fmt: skip
+            timed[stage].append(program)
+        return look_up()
+
+    def _map(self, model: Model, index: int) -> "_Map":
+        """Draw a light's map and prepare it."""
+        scene, light = self.sight.scene, self.sight.seen[index].light
+        filter = techniques(model, self.slope)[0].for_light(light)
         draw = self._programs.get(
             f"simplest draw {model.map_size}",
             partial(draw_map, model.map_size),
             self.sight.layout, scene.mesh, scene.camera, light, jnp.float32(filter.reach()),
         )  # fmt: skip
-        shadow_map = draw()
-        name = f"{model.filter} {model.map_size}"
-        prepare = self._programs.get(f"simplest prepare {name}", prepare_map, filter, shadow_map)
-        look_up = self._programs.get(
-            f"simplest look up {name}", _look_up, bias, filter, light, self.sight.surface,
-            shadow_map, prepare(),
-        )  # fmt: skip
-        for stage, program in (
-            (draw_stage, draw), (prepare_stage, prepare), (look_up_stage, look_up)
-        ):  # fmt: skip
-            timed[stage].append(program)
-        return look_up()
+        drawn = draw()
+        name = f"simplest prepare {model.filter} {model.map_size}"
+        prepare = self._programs.get(name, prepare_map, filter, drawn)
+        return _Map(draw, prepare, drawn, prepare())
+
+
+class _Map(NamedTuple):
+    """A light's map, as a filter asks it, and the programs that made it."""
+
+    draw: Timed
+    prepare: Timed
+    drawn: ShadowMap
+    prepared: Any
 
 
 def techniques(model: Model, slope: float) -> tuple[Filter, Bias]:
