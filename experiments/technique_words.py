@@ -5,6 +5,7 @@ from typing import Annotated
 
 import tyro
 
+from shadows.area_lights import AreaLight
 from shadows.bias import Bias, CombinedBias
 from shadows.compare import Compare
 from shadows.filters import Filter
@@ -83,6 +84,16 @@ def choose_layout(scene: Scene, words: Sequence[str]) -> Layout:
         return parse_technique(Layout, words, option="--layout", least=0.0)
     inside = any(stands_inside(scene, light) for light in scene.lights)
     return CubeLayout() if inside else SingleLayout()
+
+
+def least_filter(scene: Scene) -> tuple[str, ...]:
+    """Return what ``--filter`` takes for the least filter that serves most scenes of a kind.
+
+    For hard lights 2x2 texels, and for area lights few taps that look for the blocker:
+    ``python -m experiments.simplest.evidence`` compares all there are.
+    """
+    soft = any(isinstance(light, AreaLight) for light in scene.lights)
+    return ("pcss", ".taps=8", ".search_taps=8") if soft else ("bilinear",)
 
 
 def parse_lookup(filter: Sequence[str], compare: Sequence[str]) -> tuple[Filter, Compare]:

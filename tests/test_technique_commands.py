@@ -63,6 +63,29 @@ def run(monkeypatch, capsys, tmp_path):
     return run
 
 
+# Nothing said
+
+
+@pytest.mark.parametrize(
+    ("scene", "words"),
+    [
+        ("default", ["bilinear"]),
+        ("soft-lamp", ["pcss", "--filter.taps", 8, "--filter.search_taps", 8]),
+    ],
+)
+def test_the_least_filter_is_taken_for_a_scene(run, scene, words):
+    """And its bias, or the one that is asked for."""
+    for bias in ([], ["--bias", "constant=0.02"]):
+        asked = ["render", scene, *SMALL, *bias]
+        code, err, made = run(*asked, "--out", "least.exr")
+        assert code == 0, err
+        code, err, made = run(*asked, "--out", "named.exr", "--filter", *words)
+        assert code == 0, err
+        least, named = (made[f"{name}.exr"]["visibility.V"] for name in ("least", "named"))
+        np.testing.assert_array_equal(least, named)
+        assert 0.1 < least.mean() < 0.9
+
+
 # One class is all it takes
 
 

@@ -26,6 +26,7 @@ from ..technique_words import (
     LayoutWords,
     ShadingWords,
     choose_layout,
+    least_filter,
     parse_bias,
     parse_lookup,
     parse_shading,
@@ -71,7 +72,13 @@ def render(
     layout: LayoutWords = (),
     bias: BiasWords = None,
     compare: CompareWords = (),
-    filter: FilterWords = (),
+    filter: Annotated[
+        FilterWords,
+        tyro.conf.arg(
+            metavar="NAME[.OPTION=VALUE]",
+            help_behavior_hint="(default: bilinear; pcss with 8 taps under an area light)",
+        ),
+    ] = (),
     shading: ShadingWords = ("blinn-phong",),
     shadows: Annotated[
         Shadows,
@@ -180,6 +187,9 @@ def render(
         )
         loaded = prepare_scene(loaded)
         maps = choose_layout(loaded, layout)
+        if not filter:
+            lookup, _ = parse_lookup(least_filter(loaded), ())
+            terms = parse_bias(bias, lookup)
         check_scene(loaded, maps)
         check_reach(lookup, maps, shadow_map_size)
     say_notes(loaded.notes)
