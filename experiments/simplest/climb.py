@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float
 
 Values = Float[np.ndarray, " models"]
 _LEAST_GAIN = 0.005  # chance to be enough times the logarithm of the saving, to be tried
+_MANY = 15  # tried: from there on the gain must be greater, by the square of their number
 _LAST_CHANCE = 0.002  # to be enough, to be tried while none that is enough is known
 _BETTER_CHANCE = 0.2  # to be the best where none is enough; below it the search for it ends
 _MOST_FOR_BEST = 20
@@ -114,7 +115,8 @@ def climb(
         left = untried & (cost <= limit)
         dearest = 2 * cost.max() if best is None else done[best].cost
         gain = np.where(left, chance * np.log(np.maximum(dearest / cost, 1)), 0)
-        worth_trying = chance > _LAST_CHANCE if best is None else gain > _LEAST_GAIN
+        least_gain = _LEAST_GAIN * (1 + (len(done) / _MANY) ** 2)
+        worth_trying = chance > _LAST_CHANCE if best is None else gain > least_gain
         if (left & worth_trying).any():
             chosen = int(np.argmax(np.where(worth_trying, gain, -1)))
         else:
