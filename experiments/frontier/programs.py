@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-_LITTLE_S, _MUCH_S = 0.03, 0.4  # spent on a stage: more runs if below, fewer if above
-_MOST, _LEAST = 50, 2
+_LITTLE_S, _MUCH_S = 0.03, 0.25  # spent on a stage: more runs if below, fewer if above
+_MOST = 50  # runs
 _SLOW_S = 0.1  # a program so slow needs no warming
 _MOST_MAPS = 40_000  # of memory; Linux allows a process 65 530, and a program takes 60 to 200
 _OF_IMAGE = ("draw", "prepare", "image")  # stages that make an image
@@ -135,10 +135,10 @@ def run_times(timed: Timed, runs: int) -> list[float]:
     """Return the times of warm runs, ms; more of a fast program, and fewer of a slow one."""
     warming = _run_time(timed)
     times = [warming] if warming > 1e3 * _SLOW_S else []
-    while len(times) < (_MOST if sum(times) < 1e3 * _LITTLE_S else runs):
-        times.append(_run_time(timed))
-        if sum(times) > 1e3 * _MUCH_S and len(times) >= _LEAST:
+    while sum(times) < 1e3 * _MUCH_S:
+        if len(times) >= (_MOST if sum(times) < 1e3 * _LITTLE_S else runs):
             break
+        times.append(_run_time(timed))
     return times
 
 
