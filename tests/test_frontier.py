@@ -21,6 +21,7 @@ from experiments.frontier.shadow_method import Passes, biases
 from experiments.frontier.view import load_view
 from experiments.options import techniques
 from shadows import (
+    CubeLayout,
     DirectionalLight,
     DiscLight,
     Filter,
@@ -79,6 +80,12 @@ def test_an_unknown_filter_is_named():
 
 
 # Measurements
+
+
+def test_a_cube_has_no_maps_of_the_largest_size(view):
+    sizes = lambda view: {m.map_size for m in methods(("nearest",)) if m.applies(view)}
+    assert sizes(view) == {256, 512, 1024, 2048}
+    assert sizes(view._replace(layout=CubeLayout())) == {256, 512, 1024}
 
 
 def test_more_texels_are_closer_to_truth(view, programs):
@@ -319,6 +326,8 @@ def test_the_command_writes_table_and_charts(tmp_path, capsys):
     rows = pq.read_table(out / "frontier.parquet").to_pylist()
     content = json.loads((out / "frontier.json").read_text())
     assert content["rows"] == rows
+    made_with = pq.read_schema(out / "frontier.parquet").metadata
+    assert json.loads(made_with[b"versions"]) == content["versions"]
     assert {"versions", "device", "commit"} <= content.keys()
     assert [(r["setting"], r["map_size"]) for r in rows] == [
         ("bilinear", 256), ("vsm 3x3", 256), ("bilinear", 1024), ("vsm 3x3", 1024),

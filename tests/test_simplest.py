@@ -17,6 +17,7 @@ import experiments.simplest.evidence as evidence
 import experiments.simplest.models as models
 from experiments.__main__ import main
 from experiments.files.images import read_exr
+from experiments.options import parse_technique
 from experiments.rendering.render_scene import render_scene
 from experiments.scenes import load_scene
 from experiments.simplest.bench import Measured, stages
@@ -27,7 +28,8 @@ from experiments.simplest.models import Model, all_models, bias_words, biases_fo
 from experiments.simplest.search import Search
 from experiments.simplest.sight import look_at_scene, picture_of, shown
 from experiments.simplest.theory import Theory
-from experiments.technique_words import parse_bias
+from experiments.technique_words import least_filter, parse_bias
+from shadows.filters import Filter
 from shadows.layouts import CubeLayout, SingleLayout
 from tangentspace.texture import Texture
 
@@ -468,6 +470,15 @@ def test_bad_input_is_one_line_and_exit_code_2(arguments, said, monkeypatch, cap
 # Evidence
 
 
+def test_render_does_what_the_evidence_is_of():
+    for kind, scene in {"hard": "default", "area": "soft-lamp"}.items():
+        model, loaded = evidence.RENDERED[kind], load_scene(scene)
+        words = least_filter(loaded)
+        assert words == filters()[model.filter].words
+        filter = parse_technique(Filter, words, option="--filter")
+        assert parse_bias(None, filter) == parse_bias(bias_words(model.bias, 1.0), filter)
+
+
 def test_one_model_for_all():
     """By hand: of those that are enough on most scenes, the cheapest."""
     a, b, c, d = (Model("plain", name, 256, "slope") for name in "abcd")
@@ -486,12 +497,13 @@ def test_one_model_for_all():
 
 
 def test_evidence_goes_on_where_it_was(tmp_path, monkeypatch, capsys):
-    few = [Model("plain"), Model("plain", "nearest", 128, "slope")]
+    few = [Model("plain"), evidence.RENDERED["hard"]]
     monkeypatch.setattr(evidence, "all_models", lambda *of_scene: few)
     asked = {"out": tmp_path, "scenes": ("default",), "only": True, "image_size": 16, "runs": 1}
     evidence.evidence(**asked)
     first = json.loads((tmp_path / "evidence.json").read_text())
-    assert len(first["rows"]) == len(first["one_for_all"]) == len(evidence.TOLERANCES)
+    assert len(first["rows"]) == len(evidence.TOLERANCES)
+    assert [row["of"] for row in first["one_for_all"]] == ["all", "render"] * len(first["rows"])
     assert {row["models"] for row in first["rows"]} == {2}
     assert "one model for all scenes" in capsys.readouterr().out
     monkeypatch.setattr(evidence.Bench, "measure", None)  # nothing is measured again

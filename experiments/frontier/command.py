@@ -27,7 +27,7 @@ from .run import ACCURACY, TIMINGS, Cell, Contender, measure_here, run
 from .shading_method import SHADING_METHODS
 from .store import Key, Store
 
-SCENES = ("default", "bumpy", "stacked", "thin-box", "spot", "room", "soft-lamp")
+SCENES = ("default", "bumpy", "stacked", "thin-box", "sphere", "spot", "soft-lamp")
 _QUICK_SCENES = ("default", "soft-lamp")
 
 
@@ -155,7 +155,8 @@ def write(
     """Write the table, its JSON with what made it, the chart and the page."""
     made_with = {"versions": versions(), "device": device(), "commit": commit()}
     with atomic_path(out / "frontier.parquet") as temporary:
-        pq.write_table(pa.Table.from_pylist(list(rows)), temporary)
+        made = {name: json.dumps(value) for name, value in made_with.items()}
+        pq.write_table(pa.Table.from_pylist(list(rows)).replace_schema_metadata(made), temporary)
     with atomic_path(out / "frontier.json") as temporary:
         temporary.write_text(json.dumps({"rows": list(rows)} | made_with, indent=1) + "\n", "utf-8")
     for suffix in (".png", ".pdf"):

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from shadows.bias import Bias, CombinedBias, ConstantBias, SlopeBias
 from shadows.compare import Compare, HardCompare, SoftCompare
 from shadows.filters import Filter
-from shadows.layouts import Layout
+from shadows.layouts import CubeLayout, Layout
 from shadows.lights import Light
 from shadows.plane_bias import AdaptiveBias
 from shadows.render import shade, surface_visibility
@@ -37,6 +37,7 @@ Shared = tuple[Light, Surface, ShadowMap, Any]
 Drawn = tuple[ShadowMap, Light]
 _FACTORS, _LENGTHS = (0.5, 0.75, 1.0, 1.5), (0.0, 0.3, 1.0, 2.0)  # reaches, texels
 _TOLERANCES = (0.0, 0.1, 0.3, 1.0, 3.0)  # texels
+_LARGEST_IN_CUBE = 1024
 _SOFT = SoftCompare(0.5)  # of derivatives
 
 
@@ -73,8 +74,8 @@ class Method(NamedTuple):
         return parse_technique(Filter, self.words, option="--filter")
 
     def applies(self, view: View) -> bool:
-        """Whether it is for a view: for all."""
-        return True
+        """Whether it is for a view: a cube of maps of 2048 would have 25 million texels."""
+        return self.map_size <= _LARGEST_IN_CUBE or not isinstance(view.layout, CubeLayout)
 
     def accuracy(self, view: View, programs: Programs) -> tuple[dict[str, Any], bytes]:
         """Return how wrong it is, at the best of the biases that suit its filter.
