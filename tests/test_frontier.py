@@ -128,7 +128,10 @@ def test_a_round_that_is_off_is_marked():
     assert steady["draw"] is None
     assert steady["image"] == {"ms": [1.625, 2.0, 2.375], "compile_s": 1.0}
     assert steady["stable"] is True
-    assert summarize([times(1.0, 2.0, 3.0), times(4.0, 5.0, 6.0)])["stable"] is False
+    usual, low, high = times(1.0, 2.0, 3.0), times(0.1, 0.1, 0.1), times(8.0, 9.0, 9.0)
+    assert summarize([usual] * 3)["stable"] is True
+    assert summarize([usual, usual, usual, low])["stable"] is False
+    assert summarize([usual, usual, usual, high])["stable"] is False
 
 
 @pytest.mark.parametrize(("ms", "runs"), [(1.0, 30), (20.0, 3), (150.0, 2), (900.0, 1)])
@@ -195,6 +198,8 @@ def test_a_light_s_form_shines_as_it_does(light):
 def test_all_forms_share_a_program():
     assert len({jax.tree.structure(light_form(light)) for light in LIGHTS}) == 1
     image = np.ones((2, 2, 3), np.float32)
+    with pytest.raises(ValueError, match=r"LightForm\.clip_from_world: expected the light itself"):
+        light_form(LIGHTS[0]).clip_from_world(np.eye(3, dtype=np.float32))
     projector = Projector(_PLACE, _WAY, image)
     assert light_form(projector) is projector
 

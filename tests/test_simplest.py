@@ -121,6 +121,16 @@ def test_no_choice_is_above_the_budget(seed, budget):
         assert table.cost[found.best] <= budget
 
 
+def test_the_search_ends_though_each_model_has_a_small_chance():
+    """A dear model is enough, and of 300 cheap ones each is expected to miss by half."""
+    error = np.append(np.full(300, 0.015), 0.001)
+    expected = Expected(error, np.zeros(301), 2, 0.25**2 * np.eye(301))
+    cost = np.append(np.ones(300), 8.0)
+    found = climb(expected, lambda: cost, lambda k: Found(error[k], cost[k]), tolerance=0.01)
+    assert found.best == 300
+    assert 20 < len(found.tried) < 90  # measured 69; all 301 if no trial had to promise more
+
+
 def test_if_none_is_enough_the_best_is_among_those_tried():
     for seed in range(10):
         table = Table(seed)

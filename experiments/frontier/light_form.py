@@ -44,8 +44,12 @@ class LightForm(Light):
         return bright[..., None] * self.color
 
     def clip_from_world(self, points: Points) -> Float[Array, "4 4"]:
-        """Refuse: maps are drawn from the light itself."""
-        raise NotImplementedError("LightForm: draw the map from the light itself")
+        """Refuse, as what reaches surfaces does not say how wide a light's map is.
+
+        Raises:
+            ValueError: Always.
+        """
+        raise ValueError("LightForm.clip_from_world: expected the light itself, got its form")
 
 
 def light_form(light: Light) -> Light:

@@ -75,7 +75,6 @@ def render(
     filter: Annotated[
         FilterWords,
         tyro.conf.arg(
-            metavar="NAME[.OPTION=VALUE]",
             help_behavior_hint="(default: bilinear; pcss with 8 taps under an area light)",
         ),
     ] = (),
@@ -100,11 +99,9 @@ def render(
         ),
     ] = None,
     normal_map: Annotated[
-        Path | None,
+        MapFile,
         tyro.conf.arg(
-            metavar="IMAGE",
-            help="Map on the surface, .png or .exr, by its uvs; 'none' leaves out the scene's own.",
-            help_behavior_hint="(default: the scene's own)",
+            help="Map on the surface, .png or .exr, by its uvs; 'none' leaves out the scene's own."
         ),
     ] = None,
     flip_green: Annotated[

@@ -14,11 +14,7 @@ from ..provenance import commit, device, versions
 from ..rendering.render_command import SceneName
 from ..scenes import load_scene
 from .find import simplest as find
-from .report import (
-    content,
-    print_result,
-    save_comparison,
-)
+from .report import content, print_result, save_comparison
 from .sight import Measure
 
 
