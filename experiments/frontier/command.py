@@ -22,7 +22,7 @@ from .errors import FIGURES
 from .methods import methods
 from .page import save_page
 from .peers import PEERS, absent
-from .programs import summarize
+from .programs import pace_shift, summarize
 from .run import ACCURACY, TIMINGS, Cell, Contender, measure_here, run
 from .shading_method import SHADING_METHODS
 from .store import Key, Store
@@ -113,15 +113,16 @@ def table(
     scenes: Sequence[str], chosen: Sequence[Contender], store: Store, image_size: int
 ) -> Iterator[dict[str, Any]]:
     """Yield a flat row for each scene and contender that is for it."""
-    for scene, contender in product(scenes, chosen):
-        kept = [
-            store.get(Key(what, scene, contender.name, image_size)) or {}
-            for what in (ACCURACY, *TIMINGS)
-        ]
-        found, rounds = kept[0], kept[1:]
-        if not all(rounds):
-            continue
-        cost = summarize([one["stages"] for one in rounds])
+
+    def get(what: str, scene: str, contender: Contender) -> dict[str, Any]:
+        return store.get(Key(what, scene, contender.name, image_size)) or {}
+
+    timed = {pair: [get(what, *pair) for what in TIMINGS] for pair in product(scenes, chosen)}
+    timed = {pair: rounds for pair, rounds in timed.items() if all(rounds)}
+    shift = pace_shift([one["stages"] for one in rounds] for rounds in timed.values())
+    for (scene, contender), rounds in timed.items():
+        found = get(ACCURACY, scene, contender)
+        cost = summarize([one["stages"] for one in rounds], shift=shift)
         row = {
             "scene": scene, "kind": contender.kind, "name": contender.name,
             "technique": contender.technique, "setting": contender.label,
@@ -130,6 +131,7 @@ def table(
             "total_ms": cost["total_ms"][1], "total_ms_low": cost["total_ms"][0],
             "total_ms_high": cost["total_ms"][2],
             "kept_bytes": rounds[0]["kept_bytes"], "stable": cost["stable"],
+            "pace_shift": shift,
         }  # fmt: skip
         for part in ("draw", "prepare", "image", "gradient"):
             of_part = cost[part] or {"ms": [None] * 3, "compile_s": None, "temporary_bytes": None}

@@ -3,7 +3,7 @@
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -107,28 +107,55 @@ def time_stages(stages: Mapping[str, Timed | None], *, runs: int) -> dict[str, A
     }
 
 
-def summarize(rounds: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the quartiles of what was timed in several rounds.
+def pace_shift(timed: Iterable[Sequence[Mapping[str, Any]]]) -> float:
+    """Return by what factor the machine's pace shifted between rounds, as the methods saw it.
+
+    Quartiles of a few runs in a row know nothing of a machine that is slower a minute later.
+
+    Args:
+        timed: Of each method its rounds of ``time_stages``.
+
+    Returns:
+        At least 1; for nine of ten methods the medians of any two rounds are as near as that.
+    """
+    medians = [[_image_median(one) for one in rounds] for rounds in timed]
+    ratios = [max(of_one) / min(of_one) for of_one in medians if len(of_one) > 1]
+    return float(np.percentile(ratios, 90)) if ratios else 1.0
+
+
+def summarize(rounds: Sequence[Mapping[str, Any]], *, shift: float = 1.0) -> dict[str, Any]:
+    """Return the median and the range of what was timed in several rounds.
 
     Args:
         rounds: Of ``time_stages``, some time apart.
+        shift: ``pace_shift``, which widens the ranges, so that they hold what another sitting
+            would measure, and not only another run of this one.
 
     Returns:
-        The first round with quartiles for times; ``total_ms``, quartiles of the sum of all
-        stages of an image; and whether each round's median of it lies within (``stable``).
+        The first round with lower quartile, median and upper quartile for times, the quartiles
+        moved apart by ``shift``; ``total_ms``, the same of the sum of all stages of an
+        image; and whether each round's median of it lies within (``stable``).
     """
     figures = dict(rounds[0])
+    wider = np.array([1 / shift, 1, shift])
     for name, cost in rounds[0].items():
         if cost is not None:
             times = np.concatenate([one[name]["ms"] for one in rounds])
-            figures[name] = cost | {"ms": np.percentile(times, [25, 50, 75]).round(4).tolist()}
-    there = [name for name in _OF_IMAGE if figures[name] is not None]
-    sums = np.sum([figures[name]["ms"] for name in there], axis=0)
-    medians = [sum(np.median(one[name]["ms"]) for name in there) for one in rounds]
+            ms = np.percentile(times, [25, 50, 75]) * wider
+            figures[name] = cost | {"ms": ms.round(4).tolist()}
+    sums = np.sum([figures[name]["ms"] for name in _stages(rounds[0])], axis=0)
     return figures | {
         "total_ms": sums.tolist(),
-        "stable": all(bool(sums[0] <= median <= sums[2]) for median in medians),
+        "stable": all(bool(sums[0] <= _image_median(one) <= sums[2]) for one in rounds),
     }
+
+
+def _stages(figures: Mapping[str, Any]) -> list[str]:
+    return [name for name in _OF_IMAGE if figures[name] is not None]
+
+
+def _image_median(figures: Mapping[str, Any]) -> float:
+    return float(sum(np.median(figures[name]["ms"]) for name in _stages(figures)))
 
 
 def run_times(timed: Timed, runs: int) -> list[float]:
