@@ -15,7 +15,7 @@ from experiments.frontier.chart import front, save_chart
 from experiments.frontier.light_form import LightForm, light_form
 from experiments.frontier.light_motion import move_light, slope_error, truth_slopes
 from experiments.frontier.methods import MAP_SIZES, methods
-from experiments.frontier.programs import Programs, Timed, run_times, summarize
+from experiments.frontier.programs import Programs, Timed, pace_shift, run_times, summarize
 from experiments.frontier.shading_method import SHADING_METHODS
 from experiments.frontier.shadow_method import Passes, biases
 from experiments.frontier.view import load_view
@@ -132,6 +132,27 @@ def test_a_round_that_is_off_is_marked():
     assert summarize([usual] * 3)["stable"] is True
     assert summarize([usual, usual, usual, low])["stable"] is False
     assert summarize([usual, usual, usual, high])["stable"] is False
+
+
+def test_ranges_are_as_wide_as_the_pace_shifted():
+    """Nine of ten methods repeat within 1.25; of the tenth both rounds are told apart still."""
+
+    def once(ms):
+        image = {"ms": [ms, ms, ms], "compile_s": 1.0}
+        return {"draw": None, "prepare": None, "image": image, "gradient": None}
+
+    usual = [[once(4.0), once(5.0)]] * 19
+    odd = [once(4.0), once(12.0)]
+    shift = pace_shift([*usual, odd])
+    assert shift == pytest.approx(1.25)
+    assert pace_shift([*usual, odd[::-1]]) == pytest.approx(1.25)
+    assert pace_shift([[once(4.0)]]) == pace_shift([]) == 1.0
+    wide = summarize([once(4.0), once(4.0)], shift=shift)
+    assert wide["total_ms"] == [3.2, 4.0, 5.0] == wide["image"]["ms"]
+    assert summarize(odd, shift=shift)["stable"] is False
+    assert summarize(odd[:1])["stable"] is True
+    assert summarize(usual[0])["stable"] is False
+    assert summarize(usual[0], shift=shift)["stable"] is True
 
 
 @pytest.mark.parametrize(("ms", "runs"), [(1.0, 30), (20.0, 3), (150.0, 2), (900.0, 1)])

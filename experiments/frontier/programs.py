@@ -134,20 +134,26 @@ def summarize(rounds: Sequence[Mapping[str, Any]], *, shift: float = 1.0) -> dic
     Returns:
         The first round with lower quartile, median and upper quartile for times, the quartiles
         moved apart by ``shift``; ``total_ms``, the same of the sum of all stages of an
-        image; and whether each round's median of it lies within (``stable``).
+        image; and whether each round's median of it lies within what the other rounds
+        give (``stable``).
     """
     figures = dict(rounds[0])
-    wider = np.array([1 / shift, 1, shift])
     for name, cost in rounds[0].items():
         if cost is not None:
-            times = np.concatenate([one[name]["ms"] for one in rounds])
-            ms = np.percentile(times, [25, 50, 75]) * wider
-            figures[name] = cost | {"ms": ms.round(4).tolist()}
-    sums = np.sum([figures[name]["ms"] for name in _stages(rounds[0])], axis=0)
-    return figures | {
-        "total_ms": sums.tolist(),
-        "stable": all(bool(sums[0] <= _image_median(one) <= sums[2]) for one in rounds),
-    }
+            figures[name] = cost | {"ms": _range(rounds, name, shift).round(4).tolist()}
+
+    def total(rounds: Sequence[Mapping[str, Any]]) -> np.ndarray:
+        return np.sum([_range(rounds, name, shift) for name in _stages(rounds[0])], axis=0)
+
+    others = [total([*rounds[:k], *rounds[k + 1 :]] or rounds) for k in range(len(rounds))]
+    pairs = zip(rounds, others, strict=True)
+    stable = all(bool(low <= _image_median(one) <= high) for one, (low, _, high) in pairs)
+    return figures | {"total_ms": total(rounds).round(4).tolist(), "stable": stable}
+
+
+def _range(rounds: Sequence[Mapping[str, Any]], stage: str, shift: float) -> np.ndarray:
+    times = np.concatenate([one[stage]["ms"] for one in rounds])
+    return np.percentile(times, [25, 50, 75]) * [1 / shift, 1, shift]
 
 
 def _stages(figures: Mapping[str, Any]) -> list[str]:
