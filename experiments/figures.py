@@ -22,9 +22,10 @@ Image = Float[np.ndarray, "height width 3"]
 Mask = Bool[np.ndarray, "height width"]
 
 
-def on_background(color: Image, covered: Mask) -> Image:
-    """Put a light gray behind what is covered."""
-    return np.where(covered[..., None], color, np.float32(_BACKGROUND))
+def on_background(color: Image, covered: Mask | Float[np.ndarray, "height width"]) -> Image:
+    """Put a light gray behind what is covered, wholly or by a share."""
+    behind = (1 - np.asarray(covered, np.float32))[..., None] * np.float32(_BACKGROUND)
+    return np.where(np.asarray(covered)[..., None] > 0, color, np.float32(0)) + behind
 
 
 def error_picture(

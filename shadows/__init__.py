@@ -15,6 +15,9 @@ from .cache import ShadowMapCache as ShadowMapCache
 from .compare import Compare as Compare
 from .compare import HardCompare as HardCompare
 from .compare import SoftCompare as SoftCompare
+from .coverage import Coverage as Coverage
+from .coverage import blend_layers as blend_layers
+from .coverage import coverage as coverage
 from .disc_filters import PoissonFilter as PoissonFilter
 from .exponential_filters import ESMFilter as ESMFilter
 from .exponential_filters import EVSM2Filter as EVSM2Filter
@@ -25,6 +28,7 @@ from .filters import Tap as Tap
 from .filters import TapFilter as TapFilter
 from .filters import compare_taps as compare_taps
 from .filters import look_up as look_up
+from .filters import read_texel as read_texel
 from .four_moment_filter import MSMFilter as MSMFilter
 from .four_moment_filter import moment_shadow_intensity as moment_shadow_intensity
 from .interpolate import barycentric_slopes as barycentric_slopes
@@ -81,6 +85,7 @@ from .silhouettes import MeshEdges as MeshEdges
 from .silhouettes import mesh_edges as mesh_edges
 from .surface import Surface as Surface
 from .surface import render_surface as render_surface
+from .surface import surface_coverage as surface_coverage
 from .transforms import Camera as Camera
 from .transforms import OrthographicCamera as OrthographicCamera
 from .transforms import PerspectiveCamera as PerspectiveCamera

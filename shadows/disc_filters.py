@@ -59,7 +59,7 @@ def read_disc(
         radius: Of the disc, texels; one for all receivers or one for each.
 
     Returns:
-        Four taps, each with an axis for the points in front.
+        Four taps (of a map with shares eight), each with an axis for the points in front.
     """
     shape = (-1,) + (1,) * receiver.column.ndim
     across, down = (

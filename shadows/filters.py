@@ -71,7 +71,7 @@ class Filter(eqx.Module):
 
 
 class Tap(NamedTuple):
-    """One texel asked; it stays the same while only depth biases move.
+    """One texel asked, or a layer of it; it stays the same while only depth biases move.
 
     Attributes:
         stored: Depth of the texel; 1 outside the map.
@@ -116,9 +116,38 @@ class NearestFilter(TapFilter):
     def read(self, prepared: ShadowMap, receiver: Receiver) -> tuple[Tap, ...]:
         """Read one texel."""
         column, row = jnp.floor(receiver.column), jnp.floor(receiver.row)
-        stored = fetch(prepared.depth, column, row, receiver)
-        across, down = column + 0.5 - receiver.column, row + 0.5 - receiver.row
-        return (Tap(stored, jnp.ones_like(stored), across, down),)
+        return read_texel(prepared, receiver, column, row, jnp.ones_like(column))
+
+
+def read_texel(
+    shadow_map: ShadowMap,
+    receiver: Receiver,
+    column: Float[Array, "*points"],
+    row: Float[Array, "*points"],
+    weight: Float[Array, "*points"],
+) -> tuple[Tap, ...]:
+    """Read a texel of the map.
+
+    Args:
+        shadow_map: The map.
+        receiver: From which the texel is seen.
+        column: Whole number, from the left; may lie outside.
+        row: Whole number, from the top; may lie outside.
+        weight: Of the texel.
+
+    Returns:
+        The texel; of a map with shares, its two layers with their parts of the weight.
+    """
+    across, down = column + 0.5 - receiver.column, row + 0.5 - receiver.row
+    stored = fetch(shadow_map.depth, column, row, receiver)
+    if shadow_map.share is None or shadow_map.other is None:
+        return (Tap(stored, weight, across, down),)
+    share = fetch(shadow_map.share, column, row, receiver)
+    other = fetch(shadow_map.other, column, row, receiver)
+    return (
+        Tap(stored, weight * share, across, down),
+        Tap(other, weight * (1 - share), across, down),
+    )
 
 
 def compare_taps(

@@ -74,5 +74,9 @@ def _between(shadow_map: ShadowMap, share: Scalar) -> ShadowMap:
         raise ValueError(
             "bias: expected a map of two layers (render_shadow_map(..., casters='two')), got one"
         )
-    nearest = shadow_map.depth
-    return shadow_map._replace(depth=nearest + share * (shadow_map.second - nearest))
+    between = lambda nearest, second: nearest + share * (second - nearest)
+    depth = between(shadow_map.depth, shadow_map.second)
+    if shadow_map.other is None:
+        return shadow_map._replace(depth=depth)
+    other = between(shadow_map.other, shadow_map.other_second)
+    return shadow_map._replace(depth=depth, other=other)

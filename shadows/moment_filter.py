@@ -109,10 +109,17 @@ class MomentFilter(Filter):
         """
         self._check_size(*shadow_map.depth.shape[-2:])
         ratio = depth_ratio(shadow_map.texel_from_world)[..., None, None]
-        depth = _signed(linear_depth(shadow_map.depth, ratio))
-        pad = [(0, 0)] * (depth.ndim - 2) + [(self.radius, self.radius)] * 2
-        stored = self.moments(jnp.pad(depth, pad, mode="edge"))
-        levels = [tuple(self._blurred(image) for image in stored)]
+        pad = [(0, 0)] * (shadow_map.depth.ndim - 2) + [(self.radius, self.radius)] * 2
+
+        def stored(depth: Float[Array, "..."]) -> Moments:
+            return self.moments(jnp.pad(_signed(linear_depth(depth, ratio)), pad, mode="edge"))
+
+        own = stored(shadow_map.depth)
+        if shadow_map.share is not None and shadow_map.other is not None:
+            share = jnp.pad(shadow_map.share, pad, mode="edge")
+            layers = zip(own, stored(shadow_map.other), strict=True)
+            own = tuple(share * nearest + (1 - share) * other for nearest, other in layers)
+        levels = [tuple(self._blurred(image) for image in own)]
         for _ in range(self.mips):
             levels.append(tuple(_halved(image) for image in levels[-1]))
         return tuple(levels)

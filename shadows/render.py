@@ -22,13 +22,14 @@ from tangentspace.shading import BlinnPhongShading, Shading
 from .appearance import Appearance, surface_appearance
 from .bias import AnalyticBias, Bias, CombinedBias
 from .compare import Compare, HardCompare
+from .coverage import Coverage, blend_layers
 from .filters import Filter
 from .layouts import Layout, SingleLayout
 from .lights import Light
 from .plane_bias import AdaptiveBias
 from .shadow_map import Receiver, ShadowMap, choose_map, receive, render_shadow_map
 from .silhouettes import MeshEdges
-from .surface import Surface, render_surface
+from .surface import Surface, render_surface, surface_coverage
 from .transforms import Camera, Scalar
 from .volumes import volume_visibility
 from .window_filters import BilinearFilter
@@ -45,6 +46,7 @@ class Rendering(NamedTuple):
         surface: What the eye saw.
         appearance: How it looks before any light.
         shadow_maps: What each light saw; none where shadows were cast by volumes.
+        coverage: Of the pixels, where edges were asked for; the color is blended by it.
     """
 
     color: Float[Array, "height width 3"]
@@ -52,6 +54,7 @@ class Rendering(NamedTuple):
     surface: Surface
     appearance: Appearance
     shadow_maps: tuple[ShadowMap, ...]
+    coverage: Coverage | None = None
 
 
 def receive_surface(
@@ -203,6 +206,7 @@ def render(
     shadow_maps: Sequence[ShadowMap] | None = None,
     volume_edges: MeshEdges | None = None,
     cast_shadows: bool = True,
+    edges: MeshEdges | None = None,
 ) -> Rendering:
     """Render a mesh under its lights, with a shadow map for each.
 
@@ -228,13 +232,16 @@ def render(
         volume_edges: ``mesh_edges(mesh.positions, mesh.faces)``, to cast shadows by volumes
             instead of maps, of which none is drawn then; None for maps.
         cast_shadows: Whether anything blocks light; if not, no map is drawn either.
+        edges: ``mesh_edges(mesh.positions, mesh.faces)``, so that edges, of shadows and of
+            what the eye sees, are antialiased and have derivatives; None for neither.
 
     Raises:
         ValueError: If there is no light, not one kept map for each light, or the mesh lacks
             what its materials need.
 
     Differentiability:
-        In everything but the discrete choices of which face is seen; see each stage.
+        In everything but the discrete choices of which face is seen; with ``edges`` also
+        there, where shadow edges and silhouettes move. See each stage.
     """
     lights = (lights,) if isinstance(lights, Light) else tuple(lights)
     bias = default_bias(filter) if bias is None else bias
@@ -252,6 +259,7 @@ def render(
                 ),
                 map_size=map_size,
                 casters=bias.casters,
+                edges=edges,
             )
             for light in lights
         ]
@@ -285,4 +293,8 @@ def render(
         height, width = image_size
         sky = skybox(environment, camera.clip_from_world(width / height), height, width)
         color = jnp.where(surface.covered[..., None], color, sky)
-    return Rendering(color, visibilities, surface, appearance, tuple(shadow_maps))
+    covers = None
+    if edges is not None:
+        covers = surface_coverage(mesh, camera, surface, edges)
+        color = blend_layers(covers, color)
+    return Rendering(color, visibilities, surface, appearance, tuple(shadow_maps), covers)

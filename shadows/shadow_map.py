@@ -18,7 +18,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from tangentspace._math import dot, safe_divide
 
-from .rasterize import rasterize, rasterize_two
+from .coverage import coverage
+from .rasterize import Raster, rasterize, rasterize_two
+from .silhouettes import MeshEdges
+from .steady_frame import steady_frame
 from .transforms import Scalar, texel_from_clip, transform_points
 
 _STEEPEST = 100.0  # tangent of the angle to the light up to which slopes are followed
@@ -37,11 +40,17 @@ class ShadowMap(NamedTuple):
         depth: Window depth in [0, 1] of the nearest surface, 1 where there is none.
         clip_from_world: The matrix that it was made with; one for each image.
         second: Depth of the second surface, where casters of two layers were asked for.
+        share: Of each texel, covered by its own surface; None where edges have no derivatives.
+        other: Depth of the surface that covers the rest, in its plane at the texel's centre.
+        other_second: Of the second surface there.
     """
 
     depth: Float[Array, "*maps map_height map_width"]
     clip_from_world: Float[Array, "*maps 4 4"]
     second: Float[Array, "*maps map_height map_width"] | None = None
+    share: Float[Array, "*maps map_height map_width"] | None = None
+    other: Float[Array, "*maps map_height map_width"] | None = None
+    other_second: Float[Array, "*maps map_height map_width"] | None = None
 
     @property
     def texel_from_world(self) -> Float[Array, "*maps 4 4"]:
@@ -58,6 +67,7 @@ def render_shadow_map(
     *,
     map_size: int,
     casters: Casters = "nearest",
+    edges: MeshEdges | None = None,
 ) -> ShadowMap:
     """Rasterize the scene's depth from a light.
 
@@ -70,12 +80,15 @@ def render_shadow_map(
         casters: ``nearest`` surface; only ``back`` faces, turned away from the light, so
             that lit faces cannot shade themselves (wants closed meshes, and leaks where
             surfaces meet); or ``two``, the nearest surface and the one behind it.
+        edges: ``mesh_edges(positions, faces)``, to know which share of each texel its surface
+            covers, so that shadow edges have derivatives; None for not to compute that.
 
     Raises:
-        ValueError: If ``casters`` is none of these.
+        ValueError: If ``casters`` is none of these, or ``edges`` are another mesh's.
 
     Differentiability:
-        As ``rasterize``: the depth follows the plane of the face seen at each texel.
+        As ``rasterize``: the depth follows the plane of the face seen at each texel. With
+        ``edges`` also as ``coverage``: edges move with vertices and light.
 
     References:
         L. Williams, "Casting Curved Shadows on Curved Surfaces", SIGGRAPH 1978.
@@ -87,15 +100,26 @@ def render_shadow_map(
     positions, size = jnp.asarray(positions), (map_size, map_size)
 
     def one(matrix: Float[Array, "4 4"]) -> ShadowMap:
+        if edges is not None:
+            matrix = steady_frame(matrix, positions, jnp.asarray(faces))
         clip = transform_points(matrix, positions)
+        rasters: tuple[Raster, ...]
         if casters == "two":
-            first, second = rasterize_two(clip, faces, image_size=size)
-            return ShadowMap(first.depth, matrix, second.depth)
-        raster = rasterize(clip, faces, image_size=size, cull_front=casters == "back")
-        return ShadowMap(raster.depth, matrix)
+            rasters = rasterize_two(clip, faces, image_size=size)
+        else:
+            rasters = (rasterize(clip, faces, image_size=size, cull_front=casters == "back"),)
+        first, second = rasters[0].depth, rasters[1].depth if len(rasters) > 1 else None
+        if edges is None:
+            return ShadowMap(first, matrix, second)
+        found = coverage(clip, faces, edges, *rasters)
+        other, *other_second = found.depths
+        return ShadowMap(first, matrix, second, found.share, other, *other_second)
 
     matrix = jnp.asarray(clip_from_world)
-    return one(matrix) if matrix.ndim == 2 else jax.vmap(one)(matrix)
+    if matrix.ndim == 2:
+        return one(matrix)
+    # One after another, where a choice by what was found must not become both.
+    return jax.vmap(one)(matrix) if edges is None else lax.map(one, matrix)
 
 
 class PlaneSlope(NamedTuple):

@@ -9,8 +9,10 @@ from tangentspace._math import dot, safe_normalize
 from tangentspace.mesh import Mesh
 from tangentspace.vertex_normals import face_normals
 
+from .coverage import Coverage, coverage
 from .interpolate import ClipPositions, barycentrics, gather_faces, interpolate
-from .rasterize import rasterize
+from .rasterize import Raster, rasterize
+from .silhouettes import MeshEdges
 from .transforms import Camera, transform_points
 
 
@@ -81,3 +83,23 @@ def surface_at(mesh: Mesh, clip: ClipPositions, *, image_size: tuple[int, int]) 
     normal = safe_normalize(interpolate(mesh.normals, faces, raster.face_ids, weights))
     face_normal = gather_faces(face_normals(positions, faces), raster.face_ids)
     return Surface(raster.face_ids, raster.depth, position, face_normal, normal, normal, weights)
+
+
+def surface_coverage(mesh: Mesh, camera: Camera, surface: Surface, edges: MeshEdges) -> Coverage:
+    """Return which share of each pixel its own surface covers, for ``blend_layers``.
+
+    Args:
+        mesh: World space.
+        camera: The view.
+        surface: What it sees of the mesh.
+        edges: ``mesh_edges(mesh.positions, mesh.faces)``.
+
+    Raises:
+        ValueError: If the edges are those of a mesh with another number of faces.
+
+    Differentiability:
+        As ``coverage``, in positions and camera.
+    """
+    height, width = surface.face_ids.shape
+    clip = transform_points(camera.clip_from_world(width / height), mesh.positions)
+    return coverage(clip, mesh.faces, edges, Raster(surface.face_ids, surface.depth))

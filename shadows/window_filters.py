@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ._checks import check_field
-from .filters import Tap, TapFilter, fetch
+from .filters import Tap, TapFilter, read_texel
 from .shadow_map import Receiver, ShadowMap
 from .transforms import Scalar
 
@@ -33,21 +33,18 @@ class WindowFilter(TapFilter):
         """Read the window."""
         columns, rows = (self._axis(place) for place in (receiver.column, receiver.row))
         return tuple(
-            Tap(fetch(prepared.depth, column, row, receiver), across_weight * weight, across, down)
-            for row, weight, down in rows
-            for column, across_weight, across in columns
+            tap
+            for row, down_weight in rows
+            for column, across_weight in columns
+            for tap in read_texel(prepared, receiver, column, row, across_weight * down_weight)
         )
 
-    def _axis(self, place: Float[Array, "*points"]) -> list[tuple[Array, Array, Array]]:
-        """Return coordinate, weight and offset of each column or row."""
+    def _axis(self, place: Float[Array, "*points"]) -> list[tuple[Array, Array]]:
+        """Return coordinate and weight of each column or row."""
         first = jnp.floor(place - 0.5)
         weights = self.weights(place - 0.5 - first)
         before = len(weights) // 2 - 1
-        texels = [first + (k - before) for k in range(len(weights))]
-        return [
-            (texel, weight, texel + 0.5 - place)
-            for texel, weight in zip(texels, weights, strict=True)
-        ]
+        return [(first + (k - before), weight) for k, weight in enumerate(weights)]
 
 
 class BilinearFilter(WindowFilter):

@@ -4,10 +4,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
+import jax.numpy as jnp
 import numpy as np
 import tyro
 from jaxtyping import Array
 
+from shadows.coverage import blend_layers
 from shadows.render import Rendering
 from shadows.shadow_map import ShadowMap
 from shadows.shafts import Medium
@@ -83,6 +85,9 @@ def render(
         Shadows,
         tyro.conf.arg(help="Shadow maps; shadow volumes: exact and hard, without a map; or none."),
     ] = "maps",
+    antialias: Annotated[
+        bool, tyro.conf.arg(help="Smooth the edges of shadows and of what is seen.")
+    ] = False,
     mist: Annotated[
         float,
         tyro.conf.arg(
@@ -165,7 +170,9 @@ def render(
     if shadows != "maps":
         _refuse(asked, f"--shadows {shadows}")
     if light_map is not None:
-        more = {"environment": environment, "shadows": shadows != "maps"}
+        more = {
+            "environment": environment, "shadows": shadows != "maps", "antialias": antialias
+        }  # fmt: skip
         _refuse(asked | more, "--light-map")
     smooth = normal_map == Path("none")
     if flip_green and (smooth or normal_map is None):
@@ -206,10 +213,14 @@ def render(
                 layout=maps,
                 shadows=shadows,
                 medium=Medium(mist) if mist else None,
+                antialias=antialias,
             )
     for shadow_map in image.shadow_maps:
         check_shadow_map(loaded, shadow_map, casters=terms.casters)
     covered = np.asarray(image.surface.covered)
+    alpha = covered.astype(np.float32)
+    if image.coverage is not None:
+        alpha = np.asarray(blend_layers(image.coverage, jnp.asarray(alpha)))
     if not covered.any():
         say_notes(["the camera sees no surface; the image is empty"])
     if out.suffix.lower() == ".exr":
@@ -217,7 +228,7 @@ def render(
     for path in (png_out, out if out.suffix.lower() == ".png" else None):
         if path is not None:
             color = np.asarray(image.color)
-            write_png(path, color if loaded.environment else on_background(color, covered))
+            write_png(path, color if loaded.environment else on_background(color, alpha))
     if shadow_map_out is not None:
         write_exr(shadow_map_out, shadow_map_channels(image.shadow_maps))
     for path in (out, png_out, shadow_map_out):

@@ -40,6 +40,7 @@ def render_scene(
     layout: Layout = SingleLayout(),
     shadows: Shadows = "maps",
     medium: Medium | None = None,
+    antialias: bool = False,
 ) -> Rendering:
     """Render a scene under all its lights; compiled once per set of sizes and techniques.
 
@@ -54,13 +55,16 @@ def render_scene(
         layout: How many maps serve each light.
         shadows: Cast by maps, by volumes, or not at all.
         medium: Fills the space before the eye, and shows the light's shafts.
+        antialias: Whether edges of shadows and of what is seen are smoothed.
     """
     volumes = shadows == "volumes"
-    edges = mesh_edges(scene.mesh.positions, scene.mesh.faces) if volumes else None
+    edges = None
+    if volumes or antialias:
+        edges = mesh_edges(scene.mesh.positions, scene.mesh.faces)
     look = (scene.materials, scene.face_materials, scene.environment)
     arrays = (scene.mesh, scene.camera, scene.lights, look, bias, filter, compare, shading, layout)
     arrays += (edges, medium)
-    static = (image_size, map_size, shadows != "none")
+    static = (image_size, map_size, shadows != "none", volumes, antialias)
     return jax.block_until_ready(_render(jax.tree.map(jnp.asarray, arrays), static))
 
 
@@ -107,7 +111,7 @@ def shade_scene(
 def _render(arrays: tuple, static: tuple) -> Rendering:
     mesh, camera, lights, look, bias, filter, compare, shading, layout, edges, medium = arrays
     materials, face_materials, environment = look
-    image_size, map_size, cast_shadows = static
+    image_size, map_size, cast_shadows, volumes, antialias = static
     image = render(
         mesh,
         camera,
@@ -122,8 +126,9 @@ def _render(arrays: tuple, static: tuple) -> Rendering:
         face_materials=face_materials,
         environment=environment,
         shading=shading,
-        volume_edges=edges,
+        volume_edges=edges if volumes else None,
         cast_shadows=cast_shadows,
+        edges=edges if antialias else None,
     )
     if medium is None:
         return image

@@ -1,0 +1,324 @@
+"""Coverage against a slow oracle, areas in closed form, and differences."""
+
+import functools
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from jax.test_util import check_grads
+
+from shadows.coverage import blend_layers, coverage
+from shadows.rasterize import rasterize, rasterize_two
+from shadows.silhouettes import mesh_edges
+from shadows.transforms import look_at, perspective, transform_points
+from tangentspace.shapes import box, icosphere, merge, plane, torus, transform_mesh
+
+from .coverage_reference import crossings, screen_points, shares
+
+SIZE = 24
+
+
+@functools.partial(jax.jit, static_argnames="size")
+def cover(clip, faces, edges, size=SIZE):
+    raster = rasterize(clip, faces, image_size=(size, size))
+    return raster, coverage(clip, faces, edges, raster)
+
+
+def flat_clip(points, depth=0.0, dtype=np.float64):
+    """Return points in NDC as clip positions."""
+    points = np.asarray(points, dtype)
+    if points.shape[1] == 2:
+        points = np.concatenate([points, np.full((len(points), 1), depth, dtype)], axis=1)
+    return np.concatenate([points, np.ones((len(points), 1), dtype)], axis=1)
+
+
+def turned(angle):
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, s], [-s, c]])
+
+
+QUAD = np.array([[-0.45, -0.35], [0.5, -0.3], [0.4, 0.45], [-0.5, 0.3]])
+QUAD_FACES = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+
+
+def polygon_area(points):
+    x, y = points[:, 0], points[:, 1]
+    return 0.5 * jnp.abs(jnp.sum(x * jnp.roll(y, -1) - y * jnp.roll(x, -1)))
+
+
+def covered_area(clip, faces, edges, size):
+    """Return the area, in NDC, of what is not background."""
+    raster, found = cover(clip, faces, edges, size)
+    seen = (raster.face_ids >= 0).astype(clip.dtype)
+    return 4 * jnp.mean(blend_layers(found, seen))
+
+
+@given(
+    angle=st.floats(0, 6.3), scale=st.floats(0.3, 1.0), shift=st.tuples(*[st.floats(-0.2, 0.2)] * 2)
+)
+def test_areas_of_quads(angle, scale, shift):
+    points = scale * QUAD @ turned(angle) + np.array(shift)
+    area = covered_area(
+        flat_clip(points), QUAD_FACES, mesh_edges(flat_clip(points)[:, :3], QUAD_FACES), 64
+    )
+    assert abs(area - polygon_area(points)) < 2e-3  # measured 5e-4; the quad has .2 to .7
+
+
+@pytest.mark.parametrize(("size", "most"), [(64, 5e-3), (256, 4e-4)])  # measured 1.9e-3, 1.3e-4
+def test_areas_follow_single_vertices(size, most):
+    points = QUAD @ turned(0.3)
+    edges = mesh_edges(flat_clip(points)[:, :3], QUAD_FACES)
+    place = lambda p: jnp.concatenate([p, jnp.zeros((4, 1)), jnp.ones((4, 1))], axis=1)
+    change = jax.grad(lambda p: covered_area(place(p), QUAD_FACES, edges, size))(
+        jnp.asarray(points)
+    )
+    exact = jax.grad(polygon_area)(jnp.asarray(points))
+    assert np.abs(change - exact).max() < most * np.abs(exact).max()
+
+
+def test_areas_of_balls_grow_whatever_the_size_of_their_faces():
+    """20 480 faces on 900 texels: most are seen at no centre."""
+    ball = icosphere(0.55, subdivisions=5, dtype=np.float64)
+    edges = mesh_edges(ball.positions, ball.faces)
+
+    clip = jnp.asarray(flat_clip(ball.positions * [1, 1, 0.5]))
+
+    def area(scale):
+        return covered_area(clip.at[:, :3].multiply(scale), ball.faces, edges, 64)
+
+    now, change = jax.value_and_grad(area)(1.0)
+    assert float(change) == pytest.approx(2 * float(now), rel=0.01)
+
+
+def view_of(mesh, eye=(0.3, 0.5, 3.0), fov=0.6):
+    matrix = perspective(fov, 1.0, 1.0, 8.0) @ look_at(
+        np.array(eye), np.zeros(3), np.array([0.0, 1.0, 0.0])
+    )
+    return transform_points(matrix, jnp.asarray(mesh.positions))
+
+
+def scattered(seed):
+    """Return shapes apart from each other before a wall."""
+    rng = np.random.default_rng(seed)
+    parts = [transform_mesh(plane(0.8, dtype=np.float64), _placing(rng, (0, 0, -3.0), 1.0))]
+    shapes = [
+        box((0.3, 0.2, 0.25), dtype=np.float64),
+        icosphere(0.3, subdivisions=1, dtype=np.float64),
+        torus(0.3, 0.12, major_segments=9, minor_segments=6, dtype=np.float64),
+        plane(0.3, dtype=np.float64),
+    ]
+    for _k, depth in enumerate((-0.4, 0.4)):
+        shape = shapes[rng.integers(len(shapes))]
+        place = (*rng.uniform(-0.4, 0.4, 2), depth)
+        parts.append(transform_mesh(shape._replace(uvs=None), _placing(rng, place, 0.8)))
+    return filled_up(merge(*parts))
+
+
+def filled_up(mesh, vertex_count=200, face_count=300):
+    """Add vertices that no face has and faces without area, for one program to serve all."""
+    vertices, faces = vertex_count - len(mesh.positions), face_count - len(mesh.faces)
+    return mesh._replace(
+        positions=np.pad(mesh.positions, ((0, vertices), (0, 0)), mode="edge"),
+        faces=np.pad(mesh.faces, ((0, faces), (0, 0))),
+    )
+
+
+def edges_of(mesh):
+    """Return edges as many as there may be at most, for the same reason."""
+    edges = mesh_edges(mesh.positions, mesh.faces)
+    count = 3 * len(mesh.faces) - len(edges.vertices)
+    return edges._replace(vertices=np.pad(edges.vertices, ((0, count), (0, 0))))
+
+
+def _placing(rng, place, size):
+    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = size * turn * np.sign(np.linalg.det(turn)), place
+    return matrix
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_shares_are_those_of_the_oracle(seed):
+    mesh = scattered(seed)
+    clip = view_of(mesh)
+    raster, found = cover(clip, mesh.faces, edges_of(mesh))
+    points = screen_points(clip, SIZE, SIZE)
+    expected, doubtful = crossings(points, mesh.faces, np.asarray(raster.face_ids))
+    assert len(expected) > 20
+    assert doubtful.mean() < 0.05
+    error = np.where(doubtful, 0, np.abs(found.share - shares(expected, (SIZE, SIZE))))
+    assert error.max() < 1e-12
+
+
+def test_shares_do_not_depend_on_how_faces_are_wound_or_cut_at_seams():
+    mesh = scattered(3)
+    clip = view_of(mesh)
+    _, found = cover(clip, mesh.faces, edges_of(mesh))
+    rng = np.random.default_rng(0)
+    flipped = np.where(rng.random((len(mesh.faces), 1)) < 0.5, mesh.faces, mesh.faces[:, ::-1])
+    _, as_flipped = cover(clip, flipped, mesh_edges(mesh.positions, flipped))
+    np.testing.assert_allclose(as_flipped.share, found.share, atol=1e-12)
+    apart = mesh.positions[mesh.faces.reshape(-1)]
+    own = np.arange(len(apart), dtype=np.int32).reshape(-1, 3)
+    _, as_apart = cover(clip[mesh.faces.reshape(-1)], own, mesh_edges(apart, own))
+    np.testing.assert_array_equal(as_apart.share, found.share)
+
+
+def test_doubled_faces_change_nothing():
+    mesh = scattered(4)
+    clip = view_of(mesh)
+    _, found = cover(clip, mesh.faces, edges_of(mesh))
+    doubled = np.concatenate([mesh.faces, mesh.faces[:, ::-1]])
+    _, again = cover(clip, doubled, mesh_edges(mesh.positions, doubled))
+    # A doubled border is a fold: its two sides look the same way on.
+    np.testing.assert_allclose(again.share, found.share, atol=1e-12)
+
+
+def crossing_planes(offset):
+    """Two planes, tilted against each other, that meet where x + y / 2 = offset."""
+    corners = jnp.array([[-0.8, -0.8], [0.8, -0.8], [0.8, 0.8], [-0.8, 0.8]])
+    tilt = 0.3 * (corners[:, 0] + 0.5 * corners[:, 1])
+    ends = [
+        jnp.append(corners, d[:, None], axis=1) for d in (tilt - 0.3 * offset, 0.3 * offset - tilt)
+    ]
+    points = jnp.concatenate(ends)
+    return jnp.append(points, jnp.ones((8, 1)), axis=1)
+
+
+CROSSED = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], np.int32)
+
+
+@pytest.mark.parametrize("offset", [-0.21, 0.0, 0.13])
+def test_lines_where_planes_pass_through_each_other(offset):
+    edges = mesh_edges(np.asarray(crossing_planes(0.0))[:, :3], CROSSED)
+
+    def area(offset):
+        clip = crossing_planes(offset)
+        raster, found = cover(clip, CROSSED, edges, 128)
+        first = ((raster.face_ids == 0) | (raster.face_ids == 1)).astype(clip.dtype)
+        return 4 * jnp.mean(blend_layers(found, first))
+
+    value, change = jax.value_and_grad(area)(offset)
+    # A trapezoid: its middle line is from -0.8 to the offset.
+    assert float(value) == pytest.approx(1.6 * (0.8 + offset), abs=2e-3)
+    assert float(change) == pytest.approx(1.6, rel=0.01)
+
+
+def soup(seed, count=40, spread=1.0):
+    rng = np.random.default_rng(seed)
+    clip = rng.normal(size=(3 * count, 4)) * [spread, spread, 0.5, 0.3] + [0, 0, 0, 1]
+    faces = rng.integers(0, 3 * count, (count, 3)).astype(np.int32)
+    return clip, faces
+
+
+@given(seed=st.integers(0, 2**16), spread=st.sampled_from([0.02, 0.3, 1.0]))
+@settings(max_examples=60)
+def test_any_triangles_have_bounded_shares_and_finite_derivatives(seed, spread):
+    """Through each other, through the eye's plane, smaller than texels, without area."""
+    clip, faces = soup(seed, spread=spread)
+    edges = mesh_edges(clip[:, :3], faces)
+    edges = edges._replace(vertices=np.resize(edges.vertices, (120, 2)))
+    raster, found = cover(clip, faces, edges)
+    assert found.share.min() >= 0
+    assert found.share.max() <= 1
+    assert found.side.min() >= -1
+    assert found.side.max() <= 3
+    assert found.depths[0].min() >= 0
+    assert found.depths[0].max() <= 1
+    assert np.all(found.share[found.side < 0] == 1)
+    assert np.all(found.depths[0][found.side < 0] == raster.depth[found.side < 0])
+    assert np.isfinite(soup_change(clip, faces, edges)).all()
+
+
+@jax.jit
+def soup_change(clip, faces, edges):
+    def total(clip):
+        _, found = cover(clip, faces, edges)
+        return jnp.sum(found.share) + jnp.sum(found.depths[0])
+
+    return jax.grad(total)(clip)
+
+
+def test_derivatives_forward_and_reverse(monkeypatch):
+    """Of the shares as they are; that long edges have exact ends, tests of areas see."""
+    monkeypatch.setattr(sys.modules["shadows.coverage"], "_edge_length", lambda *_: 1.0)
+    mesh = scattered(5)
+    edges, clip = edges_of(mesh), view_of(mesh)
+    weights = np.random.default_rng(0).normal(size=(2, SIZE, SIZE))
+    raster, _ = cover(clip, mesh.faces, edges)
+
+    @jax.jit
+    def total(clip):
+        found = coverage(clip, mesh.faces, edges, raster)
+        return jnp.sum(weights[0] * found.share) + jnp.sum(weights[1] * found.depths[0])
+
+    check_grads(total, (clip,), order=1, modes=("fwd", "rev"), eps=1e-7, atol=1e-4, rtol=1e-4)
+
+
+def test_the_other_depth_is_that_of_the_plane_behind():
+    """A floor, tilted, behind a quad: at the quad's edges the floor's depth at that very texel."""
+    front = flat_clip(0.5 * QUAD, depth=-0.5)
+    back = flat_clip([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    back[:, 2] = 0.3 * back[:, 0] + 0.2 * back[:, 1] + 0.1
+    clip = np.concatenate([front, back])
+    faces = np.concatenate([QUAD_FACES, QUAD_FACES + 4])
+    raster, found = cover(clip, faces, mesh_edges(clip[:, :3], faces))
+    x = (2 * np.arange(SIZE) + 1) / SIZE - 1
+    floor = 0.5 + 0.5 * (0.3 * x[None] - 0.2 * x[:, None] + 0.1)
+    cut = np.asarray(found.side) >= 0
+    near = np.asarray(raster.face_ids) < 2
+    assert (cut & near).sum() > 10
+    assert (cut & ~near).sum() > 5
+    np.testing.assert_allclose(found.depths[0][cut & near], floor[cut & near], atol=1e-12)
+    np.testing.assert_allclose(found.depths[0][cut & ~near], 0.25, atol=1e-12)
+
+
+def test_two_layers_have_two_other_depths():
+    mesh = scattered(6)
+    clip, edges = view_of(mesh), mesh_edges(mesh.positions, mesh.faces)
+    rasters = rasterize_two(clip, mesh.faces, image_size=(SIZE, SIZE))
+    found = coverage(clip, mesh.faces, edges, *rasters)
+    alone = coverage(clip, mesh.faces, edges, rasters[0])
+    np.testing.assert_array_equal(found.share, alone.share)
+    np.testing.assert_array_equal(found.depths[0], alone.depths[0])
+    cut = np.asarray(found.side) >= 0
+    assert np.mean(found.depths[1][cut] >= found.depths[0][cut] - 1e-3) > 0.95
+
+
+def test_one_texel_has_no_neighbours():
+    clip = flat_clip(QUAD)
+    _, found = cover(clip, QUAD_FACES, mesh_edges(clip[:, :3], QUAD_FACES), 1)
+    assert found.share == 1
+    assert found.side == -1
+
+
+@pytest.mark.errors
+def test_edges_of_another_mesh_are_refused():
+    clip = flat_clip(QUAD)
+    raster = rasterize(clip, QUAD_FACES, image_size=(4, 4))
+    edges = mesh_edges(clip[:3, :3], QUAD_FACES[:1])
+    with pytest.raises(ValueError, match="coverage: expected `edges` of 2 faces, got those of 1"):
+        coverage(clip, QUAD_FACES, edges, raster)
+
+
+def test_blended_colors_stay_between_those_that_are_blended():
+    mesh = scattered(7)
+    _raster, found = cover(view_of(mesh), mesh.faces, edges_of(mesh))
+    image = np.random.default_rng(1).uniform(0.2, 0.7, (SIZE, SIZE, 3))
+    blended = blend_layers(found, jnp.asarray(image))
+    padded = np.pad(image, ((1, 1), (1, 1), (0, 0)), mode="edge")
+    around = np.stack(
+        [padded[1:-1, 2:], padded[1:-1, :-2], padded[2:, 1:-1], padded[:-2, 1:-1], image]
+    )
+    assert np.all(blended <= around.max(axis=0) + 1e-12)
+    assert np.all(blended >= around.min(axis=0) - 1e-12)
+    side, share = np.asarray(found.side), np.asarray(found.share)
+    row, column = np.argwhere(side == 2)[0]
+    expected = (
+        share[row, column] * image[row, column] + (1 - share[row, column]) * image[row + 1, column]
+    )
+    np.testing.assert_allclose(blended[row, column], expected)
