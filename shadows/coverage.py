@@ -85,8 +85,10 @@ def coverage(
 
     Differentiability:
         ``share`` and ``depths`` in ``clip_positions``, forward and reverse: the derivative of
-        shares, summed along an edge, is that of the area that the edge bounds. Finite
-        everywhere; 0 where a texel is so crowded that no share is left of its own.
+        shares, summed along an edge, is that of the area that the edge bounds. For that sum
+        to be right, the texels at the ends of a long edge count for all of it that is left
+        there: their derivatives are not those of their own shares. Finite everywhere; 0 where
+        a texel is so crowded that no share is left of its own.
     """
     corners = jnp.asarray(faces)
     if edges.edge_ids.shape != corners.shape:
