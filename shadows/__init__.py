@@ -18,6 +18,7 @@ from .compare import SoftCompare as SoftCompare
 from .coverage import Coverage as Coverage
 from .coverage import blend_layers as blend_layers
 from .coverage import coverage as coverage
+from .coverage import neighbor_depth as neighbor_depth
 from .disc_filters import PoissonFilter as PoissonFilter
 from .exponential_filters import ESMFilter as ESMFilter
 from .exponential_filters import EVSM2Filter as EVSM2Filter
@@ -70,6 +71,7 @@ from .render import receive_surface as receive_surface
 from .render import render as render
 from .render import shade as shade
 from .render import surface_visibility as surface_visibility
+from .shadow_map import NeighborLayer as NeighborLayer
 from .shadow_map import PlaneSlope as PlaneSlope
 from .shadow_map import Receiver as Receiver
 from .shadow_map import ShadowMap as ShadowMap

@@ -103,7 +103,7 @@ def row_ranges(
     for outside in (x < -w, x > w, z < -w, (z > w) & cull_far):
         visible &= ~jnp.all(outside, axis=0)
     if cull_back or cull_front:
-        area = _area(x, y, w)
+        area = signed_area(x, y, w)
         visible &= ~((area <= 0) & cull_back) & ~((area >= 0) & cull_front)
     slack = 4 * height * float(jnp.finfo(x.dtype).eps)
     first = jnp.ceil(jnp.clip(low - 0.5 - slack, 0, height)).astype(jnp.int32)
@@ -111,7 +111,7 @@ def row_ranges(
     return first, jnp.where(visible, jnp.maximum(last - first, 0), 0)
 
 
-def _area(x: Corners, y: Corners, w: Corners) -> Float[Array, " faces"]:
+def signed_area(x: Corners, y: Corners, w: Corners) -> Float[Array, " faces"]:
     """Return a number of the sign of each face's area in NDC, front faces positive.
 
     Relative to a ray through the first corner: that leaves the determinant as it is, and

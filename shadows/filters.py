@@ -140,10 +140,10 @@ def read_texel(
     """
     across, down = column + 0.5 - receiver.column, row + 0.5 - receiver.row
     stored = fetch(shadow_map.depth, column, row, receiver)
-    if shadow_map.share is None or shadow_map.other is None:
+    if shadow_map.neighbor is None:
         return (Tap(stored, weight, across, down),)
-    share = fetch(shadow_map.share, column, row, receiver)
-    other = fetch(shadow_map.other, column, row, receiver)
+    share = fetch(shadow_map.neighbor.share, column, row, receiver)
+    other = fetch(shadow_map.neighbor.depth, column, row, receiver)
     return (
         Tap(stored, weight * share, across, down),
         Tap(other, weight * (1 - share), across, down),

@@ -76,7 +76,7 @@ def _between(shadow_map: ShadowMap, share: Scalar) -> ShadowMap:
         )
     between = lambda nearest, second: nearest + share * (second - nearest)
     depth = between(shadow_map.depth, shadow_map.second)
-    if shadow_map.other is None:
-        return shadow_map._replace(depth=depth)
-    other = between(shadow_map.other, shadow_map.other_second)
-    return shadow_map._replace(depth=depth, other=other)
+    neighbor = shadow_map.neighbor
+    if neighbor is not None:
+        neighbor = neighbor._replace(depth=between(neighbor.depth, neighbor.second))
+    return shadow_map._replace(depth=depth, neighbor=neighbor)

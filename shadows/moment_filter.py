@@ -115,9 +115,9 @@ class MomentFilter(Filter):
             return self.moments(jnp.pad(_signed(linear_depth(depth, ratio)), pad, mode="edge"))
 
         own = stored(shadow_map.depth)
-        if shadow_map.share is not None and shadow_map.other is not None:
-            share = jnp.pad(shadow_map.share, pad, mode="edge")
-            layers = zip(own, stored(shadow_map.other), strict=True)
+        if shadow_map.neighbor is not None:
+            share = jnp.pad(shadow_map.neighbor.share, pad, mode="edge")
+            layers = zip(own, stored(shadow_map.neighbor.depth), strict=True)
             own = tuple(share * nearest + (1 - share) * other for nearest, other in layers)
         levels = [tuple(self._blurred(image) for image in own)]
         for _ in range(self.mips):

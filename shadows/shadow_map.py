@@ -18,10 +18,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from tangentspace._math import dot, safe_divide
 
-from .coverage import coverage
+from .coverage import coverage, neighbor_depth
 from .rasterize import Raster, rasterize, rasterize_two
 from .silhouettes import MeshEdges
-from .steady_frame import steady_frame
+from .steady_frame import main_plane, steady_frame
 from .transforms import Scalar, texel_from_clip, transform_points
 
 _STEEPEST = 100.0  # tangent of the angle to the light up to which slopes are followed
@@ -33,6 +33,20 @@ Coordinates = list[Array]
 Casters = Literal["nearest", "back", "two"]
 
 
+class NeighborLayer(NamedTuple):
+    """What covers the rest of each texel: the surface that a neighbour sees.
+
+    Attributes:
+        share: Of the texel, covered by its own surface.
+        depth: Window depth of the neighbour's surface, in its plane at the texel's centre.
+        second: Of the neighbour's second surface, where casters of two layers were asked for.
+    """
+
+    share: Float[Array, "*maps map_height map_width"]
+    depth: Float[Array, "*maps map_height map_width"]
+    second: Float[Array, "*maps map_height map_width"] | None = None
+
+
 class ShadowMap(NamedTuple):
     """The nearest surface seen from a light.
 
@@ -40,17 +54,13 @@ class ShadowMap(NamedTuple):
         depth: Window depth in [0, 1] of the nearest surface, 1 where there is none.
         clip_from_world: The matrix that it was made with; one for each image.
         second: Depth of the second surface, where casters of two layers were asked for.
-        share: Of each texel, covered by its own surface; None where edges have no derivatives.
-        other: Depth of the surface that covers the rest, in its plane at the texel's centre.
-        other_second: Of the second surface there.
+        neighbor: What covers the rest of each texel; None where edges have no derivatives.
     """
 
     depth: Float[Array, "*maps map_height map_width"]
     clip_from_world: Float[Array, "*maps 4 4"]
     second: Float[Array, "*maps map_height map_width"] | None = None
-    share: Float[Array, "*maps map_height map_width"] | None = None
-    other: Float[Array, "*maps map_height map_width"] | None = None
-    other_second: Float[Array, "*maps map_height map_width"] | None = None
+    neighbor: NeighborLayer | None = None
 
     @property
     def texel_from_world(self) -> Float[Array, "*maps 4 4"]:
@@ -99,21 +109,23 @@ def render_shadow_map(
         )
     positions, size = jnp.asarray(positions), (map_size, map_size)
 
+    steady = None if edges is None else main_plane(positions, faces)
+
     def one(matrix: Float[Array, "4 4"]) -> ShadowMap:
-        if edges is not None:
-            matrix = steady_frame(matrix, positions, jnp.asarray(faces))
+        if steady is not None:
+            matrix = steady_frame(matrix, steady)
         clip = transform_points(matrix, positions)
         rasters: tuple[Raster, ...]
         if casters == "two":
             rasters = rasterize_two(clip, faces, image_size=size)
         else:
             rasters = (rasterize(clip, faces, image_size=size, cull_front=casters == "back"),)
-        first, second = rasters[0].depth, rasters[1].depth if len(rasters) > 1 else None
+        depth, second = (rasters[0].depth, rasters[1].depth if len(rasters) > 1 else None)
         if edges is None:
-            return ShadowMap(first, matrix, second)
-        found = coverage(clip, faces, edges, *rasters)
-        other, *other_second = found.depths
-        return ShadowMap(first, matrix, second, found.share, other, *other_second)
+            return ShadowMap(depth, matrix, second)
+        covers = coverage(clip, faces, edges, rasters[0].face_ids)
+        others = (neighbor_depth(clip, faces, covers, raster) for raster in rasters)
+        return ShadowMap(depth, matrix, second, NeighborLayer(covers.share, *others))
 
     matrix = jnp.asarray(clip_from_world)
     if matrix.ndim == 2:

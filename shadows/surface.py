@@ -11,7 +11,7 @@ from tangentspace.vertex_normals import face_normals
 
 from .coverage import Coverage, coverage
 from .interpolate import ClipPositions, barycentrics, gather_faces, interpolate
-from .rasterize import Raster, rasterize
+from .rasterize import rasterize
 from .silhouettes import MeshEdges
 from .transforms import Camera, transform_points
 
@@ -102,4 +102,4 @@ def surface_coverage(mesh: Mesh, camera: Camera, surface: Surface, edges: MeshEd
     """
     height, width = surface.face_ids.shape
     clip = transform_points(camera.clip_from_world(width / height), mesh.positions)
-    return coverage(clip, mesh.faces, edges, Raster(surface.face_ids, surface.depth))
+    return coverage(clip, mesh.faces, edges, surface.face_ids)

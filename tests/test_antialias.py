@@ -11,6 +11,7 @@ from experiments.scenes.staging import placed
 from shadows import (
     CubeLayout,
     MidpointBias,
+    NeighborLayer,
     PointLight,
     ShadowMap,
     mesh_edges,
@@ -82,10 +83,8 @@ def test_a_map_without_edges_has_no_shares(scene):
         map_size=64, edges=edges,
     )  # fmt: skip
     plain, shared = draw(None), draw(mesh_edges(scene.mesh.positions, scene.mesh.faces))
-    assert plain.share is None
-    assert plain.other is None
-    assert shared.share is not None
-    assert shared.other is not None
+    assert plain.neighbor is None
+    assert shared.neighbor.share.shape == shared.depth.shape
     np.testing.assert_array_equal(plain.depth, shared.depth)
     np.testing.assert_allclose(plain.clip_from_world, shared.clip_from_world, rtol=1e-6, atol=1e-6)
 
@@ -114,7 +113,9 @@ def test_a_texel_is_read_as_two_layers_with_parts_of_its_weight():
     place = jnp.array([1.0]), jnp.array([2.0]), jnp.array([0.5])
     (whole,) = read_texel(ShadowMap(depth, jnp.eye(4)), receiver, *place)
     assert (whole.stored, whole.weight) == (0.25, 0.5)
-    near, far = read_texel(ShadowMap(depth, jnp.eye(4), None, share, other), receiver, *place)
+    near, far = read_texel(
+        ShadowMap(depth, jnp.eye(4), neighbor=NeighborLayer(share, other)), receiver, *place
+    )
     assert (near.stored, near.weight) == (0.25, 0.375)
     assert (far.stored, far.weight) == (0.5, 0.125)
     assert near.across == far.across == whole.across

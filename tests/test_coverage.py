@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax.test_util import check_grads
 
-from shadows.coverage import blend_layers, coverage
-from shadows.rasterize import rasterize, rasterize_two
+from shadows.coverage import blend_layers, coverage, neighbor_depth
+from shadows.rasterize import Raster, rasterize, rasterize_two
 from shadows.silhouettes import mesh_edges
 from shadows.transforms import look_at, perspective, transform_points
 from tangentspace.shapes import box, icosphere, merge, plane, torus, transform_mesh
@@ -25,7 +25,8 @@ SIZE = 24
 @functools.partial(jax.jit, static_argnames="size")
 def cover(clip, faces, edges, size=SIZE):
     raster = rasterize(clip, faces, image_size=(size, size))
-    return raster, coverage(clip, faces, edges, raster)
+    found = coverage(clip, faces, edges, raster.face_ids)
+    return raster, found, neighbor_depth(clip, faces, found, raster)
 
 
 def flat_clip(points, depth=0.0, dtype=np.float64):
@@ -52,7 +53,7 @@ def polygon_area(points):
 
 def covered_area(clip, faces, edges, size):
     """Return the area, in NDC, of what is not background."""
-    raster, found = cover(clip, faces, edges, size)
+    raster, found, _ = cover(clip, faces, edges, size)
     seen = (raster.face_ids >= 0).astype(clip.dtype)
     return 4 * jnp.mean(blend_layers(found, seen))
 
@@ -145,7 +146,7 @@ def _placing(rng, place, size):
 def test_shares_are_those_of_the_oracle(seed):
     mesh = scattered(seed)
     clip = view_of(mesh)
-    raster, found = cover(clip, mesh.faces, edges_of(mesh))
+    raster, found, _ = cover(clip, mesh.faces, edges_of(mesh))
     points = screen_points(clip, SIZE, SIZE)
     expected, doubtful = crossings(points, mesh.faces, np.asarray(raster.face_ids))
     assert len(expected) > 20
@@ -157,23 +158,23 @@ def test_shares_are_those_of_the_oracle(seed):
 def test_shares_do_not_depend_on_how_faces_are_wound_or_cut_at_seams():
     mesh = scattered(3)
     clip = view_of(mesh)
-    _, found = cover(clip, mesh.faces, edges_of(mesh))
+    found = cover(clip, mesh.faces, edges_of(mesh))[1]
     rng = np.random.default_rng(0)
     flipped = np.where(rng.random((len(mesh.faces), 1)) < 0.5, mesh.faces, mesh.faces[:, ::-1])
-    _, as_flipped = cover(clip, flipped, mesh_edges(mesh.positions, flipped))
+    as_flipped = cover(clip, flipped, mesh_edges(mesh.positions, flipped))[1]
     np.testing.assert_allclose(as_flipped.share, found.share, atol=1e-12)
     apart = mesh.positions[mesh.faces.reshape(-1)]
     own = np.arange(len(apart), dtype=np.int32).reshape(-1, 3)
-    _, as_apart = cover(clip[mesh.faces.reshape(-1)], own, mesh_edges(apart, own))
-    np.testing.assert_array_equal(as_apart.share, found.share)
+    as_apart = cover(clip[mesh.faces.reshape(-1)], own, mesh_edges(apart, own))[1]
+    np.testing.assert_allclose(as_apart.share, found.share, atol=1e-12)
 
 
 def test_doubled_faces_change_nothing():
     mesh = scattered(4)
     clip = view_of(mesh)
-    _, found = cover(clip, mesh.faces, edges_of(mesh))
+    found = cover(clip, mesh.faces, edges_of(mesh))[1]
     doubled = np.concatenate([mesh.faces, mesh.faces[:, ::-1]])
-    _, again = cover(clip, doubled, mesh_edges(mesh.positions, doubled))
+    again = cover(clip, doubled, mesh_edges(mesh.positions, doubled))[1]
     # A doubled border is a fold: its two sides look the same way on.
     np.testing.assert_allclose(again.share, found.share, atol=1e-12)
 
@@ -198,7 +199,7 @@ def test_lines_where_planes_pass_through_each_other(offset):
 
     def area(offset):
         clip = crossing_planes(offset)
-        raster, found = cover(clip, CROSSED, edges, 128)
+        raster, found, _ = cover(clip, CROSSED, edges, 128)
         first = ((raster.face_ids == 0) | (raster.face_ids == 1)).astype(clip.dtype)
         return 4 * jnp.mean(blend_layers(found, first))
 
@@ -222,23 +223,23 @@ def test_any_triangles_have_bounded_shares_and_finite_derivatives(seed, spread):
     clip, faces = soup(seed, spread=spread)
     edges = mesh_edges(clip[:, :3], faces)
     edges = edges._replace(vertices=np.resize(edges.vertices, (120, 2)))
-    raster, found = cover(clip, faces, edges)
+    raster, found, depth = cover(clip, faces, edges)
     assert found.share.min() >= 0
     assert found.share.max() <= 1
     assert found.side.min() >= -1
     assert found.side.max() <= 3
-    assert found.depths[0].min() >= 0
-    assert found.depths[0].max() <= 1
+    assert depth.min() >= 0
+    assert depth.max() <= 1
     assert np.all(found.share[found.side < 0] == 1)
-    assert np.all(found.depths[0][found.side < 0] == raster.depth[found.side < 0])
+    assert np.all(depth[found.side < 0] == raster.depth[found.side < 0])
     assert np.isfinite(soup_change(clip, faces, edges)).all()
 
 
 @jax.jit
 def soup_change(clip, faces, edges):
     def total(clip):
-        _, found = cover(clip, faces, edges)
-        return jnp.sum(found.share) + jnp.sum(found.depths[0])
+        _, found, depth = cover(clip, faces, edges)
+        return jnp.sum(found.share) + jnp.sum(depth)
 
     return jax.grad(total)(clip)
 
@@ -249,49 +250,73 @@ def test_derivatives_forward_and_reverse(monkeypatch):
     mesh = scattered(5)
     edges, clip = edges_of(mesh), view_of(mesh)
     weights = np.random.default_rng(0).normal(size=(2, SIZE, SIZE))
-    raster, _ = cover(clip, mesh.faces, edges)
+    ids = cover(clip, mesh.faces, edges)[0].face_ids
 
     @jax.jit
     def total(clip):
-        found = coverage(clip, mesh.faces, edges, raster)
-        return jnp.sum(weights[0] * found.share) + jnp.sum(weights[1] * found.depths[0])
+        found = coverage(clip, mesh.faces, edges, ids)
+        depth = neighbor_depth(clip, mesh.faces, found, Raster(ids, jnp.zeros(ids.shape)))
+        return jnp.sum(weights[0] * found.share) + jnp.sum(weights[1] * depth)
 
     check_grads(total, (clip,), order=1, modes=("fwd", "rev"), eps=1e-7, atol=1e-4, rtol=1e-4)
 
 
-def test_the_other_depth_is_that_of_the_plane_behind():
+def test_the_neighbor_depth_is_that_of_the_plane_behind():
     """A floor, tilted, behind a quad: at the quad's edges the floor's depth at that very texel."""
     front = flat_clip(0.5 * QUAD, depth=-0.5)
     back = flat_clip([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     back[:, 2] = 0.3 * back[:, 0] + 0.2 * back[:, 1] + 0.1
     clip = np.concatenate([front, back])
     faces = np.concatenate([QUAD_FACES, QUAD_FACES + 4])
-    raster, found = cover(clip, faces, mesh_edges(clip[:, :3], faces))
+    raster, found, depth = cover(clip, faces, mesh_edges(clip[:, :3], faces))
     x = (2 * np.arange(SIZE) + 1) / SIZE - 1
     floor = 0.5 + 0.5 * (0.3 * x[None] - 0.2 * x[:, None] + 0.1)
     cut = np.asarray(found.side) >= 0
     near = np.asarray(raster.face_ids) < 2
     assert (cut & near).sum() > 10
     assert (cut & ~near).sum() > 5
-    np.testing.assert_allclose(found.depths[0][cut & near], floor[cut & near], atol=1e-12)
-    np.testing.assert_allclose(found.depths[0][cut & ~near], 0.25, atol=1e-12)
+    np.testing.assert_allclose(depth[cut & near], floor[cut & near], atol=1e-12)
+    np.testing.assert_allclose(depth[cut & ~near], 0.25, atol=1e-12)
 
 
-def test_two_layers_have_two_other_depths():
+def test_two_layers_have_two_neighbor_depths():
     mesh = scattered(6)
-    clip, edges = view_of(mesh), mesh_edges(mesh.positions, mesh.faces)
-    rasters = rasterize_two(clip, mesh.faces, image_size=(SIZE, SIZE))
-    found = coverage(clip, mesh.faces, edges, *rasters)
-    alone = coverage(clip, mesh.faces, edges, rasters[0])
-    np.testing.assert_array_equal(found.share, alone.share)
-    np.testing.assert_array_equal(found.depths[0], alone.depths[0])
+    clip, edges = view_of(mesh), edges_of(mesh)
+    _, found, nearest = cover(clip, mesh.faces, edges)
+    _, second = rasterize_two(clip, mesh.faces, image_size=(SIZE, SIZE))
+    behind = jax.jit(neighbor_depth)(clip, mesh.faces, found, second)
     cut = np.asarray(found.side) >= 0
-    assert np.mean(found.depths[1][cut] >= found.depths[0][cut] - 1e-3) > 0.95
+    np.testing.assert_array_equal(behind[~cut], second.depth[~cut])
+    assert np.mean(behind[cut] >= nearest[cut] - 1e-3) > 0.95
+    assert np.mean(behind[cut] > nearest[cut] + 1e-3) > 0.5
+
+
+def test_more_crossings_than_there_usually_are_change_nothing(monkeypatch):
+    """The same shares, depths and derivatives when a choice holds one and all others follow."""
+    mesh = scattered(8)
+    clip, edges = view_of(mesh), edges_of(mesh)
+    weights = np.random.default_rng(0).normal(size=(2, SIZE, SIZE))
+
+    def total(clip):
+        raster = rasterize(clip, mesh.faces, image_size=(SIZE, SIZE))
+        found = coverage(clip, mesh.faces, edges, raster.face_ids)
+        depth = neighbor_depth(clip, mesh.faces, found, raster)
+        return jnp.sum(weights[0] * found.share) + jnp.sum(weights[1] * depth)
+
+    usual = jax.jit(jax.value_and_grad(total))(clip)
+    module = sys.modules["shadows.coverage"]
+    few_or_all = module._few_or_all
+    monkeypatch.setattr(
+        module, "_few_or_all", lambda run, n, few, most: few_or_all(run, n, 1, most)
+    )
+    crowded = jax.jit(jax.value_and_grad(lambda clip: total(clip)))(clip)
+    np.testing.assert_allclose(crowded[0], usual[0], rtol=1e-12)
+    np.testing.assert_allclose(crowded[1], usual[1], rtol=1e-12, atol=1e-12)
 
 
 def test_one_texel_has_no_neighbours():
     clip = flat_clip(QUAD)
-    _, found = cover(clip, QUAD_FACES, mesh_edges(clip[:, :3], QUAD_FACES), 1)
+    found = cover(clip, QUAD_FACES, mesh_edges(clip[:, :3], QUAD_FACES), 1)[1]
     assert found.share == 1
     assert found.side == -1
 
@@ -302,12 +327,12 @@ def test_edges_of_another_mesh_are_refused():
     raster = rasterize(clip, QUAD_FACES, image_size=(4, 4))
     edges = mesh_edges(clip[:3, :3], QUAD_FACES[:1])
     with pytest.raises(ValueError, match="coverage: expected `edges` of 2 faces, got those of 1"):
-        coverage(clip, QUAD_FACES, edges, raster)
+        coverage(clip, QUAD_FACES, edges, raster.face_ids)
 
 
 def test_blended_colors_stay_between_those_that_are_blended():
     mesh = scattered(7)
-    _raster, found = cover(view_of(mesh), mesh.faces, edges_of(mesh))
+    found = cover(view_of(mesh), mesh.faces, edges_of(mesh))[1]
     image = np.random.default_rng(1).uniform(0.2, 0.7, (SIZE, SIZE, 3))
     blended = blend_layers(found, jnp.asarray(image))
     padded = np.pad(image, ((1, 1), (1, 1), (0, 0)), mode="edge")
