@@ -75,7 +75,7 @@ class _Walker(NamedTuple):
     last: Index
 
 
-class _Links(NamedTuple):
+class Links(NamedTuple):
     """Which faces lie beside each other in the image.
 
     Attributes:
@@ -92,15 +92,21 @@ class _Links(NamedTuple):
     backward: Int[Array, " edges"]
     vertices: tuple[Int[Array, " edges"], ...]
 
+    @property
+    def outline(self) -> Bool[Array, " edges"]:
+        """Where the surface ends or turns back."""
+        none = self.edge_ids[0].size
+        return (self.forward == none) != (self.backward == none)
+
 
 def find_crossings(
-    screen: Screen, edges: MeshEdges, face_ids: Int[Array, "height width"]
+    screen: Screen, links: Links, face_ids: Int[Array, "height width"]
 ) -> tuple[Crossings, Crossings]:
     """Look between all neighbouring texels that see different faces.
 
     Args:
         screen: The mesh in the image.
-        edges: Of the mesh.
+        links: ``link_faces`` of the same.
         face_ids: The face seen at each texel, -1 where there is none.
 
     Returns:
@@ -110,7 +116,7 @@ def find_crossings(
     right = jnp.pad(face_ids[:, 1:] != face_ids[:, :-1], ((0, 0), (0, 1)))
     below = jnp.pad(face_ids[1:] != face_ids[:-1], ((0, 1), (0, 0)))
     pairs = marked(jnp.concatenate([right.reshape(-1), below.reshape(-1)]))
-    links, ids = _links(screen, edges), face_ids.reshape(-1)
+    ids = face_ids.reshape(-1)
     walks, count = _follow(screen, links, *pairs, ids, width)
     piece = min(_PIECE, walks.pair.size)
     none = jnp.zeros_like(walks.pair)
@@ -151,7 +157,8 @@ def _put(
     return jax.tree.map(put, kept, values), ends[-1]
 
 
-def _links(screen: Screen, edges: MeshEdges) -> _Links:
+def link_faces(screen: Screen, edges: MeshEdges) -> Links:
+    """Find which faces lie beside each other in the image."""
     edge_ids = jnp.asarray(edges.edge_ids)
     corners = jnp.stack(screen.corners)
     area = signed_area(*(get(axis, corners) for axis in (screen.column, screen.row, screen.w)))
@@ -165,12 +172,12 @@ def _links(screen: Screen, edges: MeshEdges) -> _Links:
         return none.at[jnp.where(chosen, edge_ids, edge_count)].min(face, mode="drop")
 
     ends = tuple(jnp.asarray(edges.vertices).T)
-    return _Links(tuple(edge_ids.T), tuple(runs.T), first(runs > 0), first(runs < 0), ends)
+    return Links(tuple(edge_ids.T), tuple(runs.T), first(runs > 0), first(runs < 0), ends)
 
 
 def _follow(
     screen: Screen,
-    links: _Links,
+    links: Links,
     pairs: Index,
     total: Int[Array, ""],
     ids: Int[Array, " texels"],
@@ -235,7 +242,7 @@ def _ways(pair: Index, width: int, texels: int) -> Ways:
 
 
 def _leave(
-    screen: Screen, links: _Links, ways: Ways, face: Index, came_by: Index
+    screen: Screen, links: Links, ways: Ways, face: Index, came_by: Index
 ) -> tuple[Length, Index, Index]:
     """Return where a face is left: how far along the way, by which edge, and how it runs there.
 
@@ -258,7 +265,7 @@ def _leave(
 
 
 def _meet(
-    screen: Screen, links: _Links, walks: _Walks, ids: Int[Array, " texels"], width: int
+    screen: Screen, links: Links, walks: _Walks, ids: Int[Array, " texels"], width: int
 ) -> tuple[Crossings, Crossings]:
     """Return edges and lines on each way; for their total, whether they are there."""
     ways = _ways(walks.pair, width, ids.size)
@@ -286,7 +293,7 @@ def _meet(
     return at_edges, Crossings(ways.texel, ways.side, (back_last, last), cross)
 
 
-def _edge_depth(screen: Screen, links: _Links, ways: Ways, edge: Index) -> tuple[Length, Length]:
+def _edge_depth(screen: Screen, links: Links, ways: Ways, edge: Index) -> tuple[Length, Length]:
     """Return how far along the way an edge crosses it, and its window depth there."""
     vertices = [get(end, edge) for end in links.vertices]
     a, b = (place(screen, ways, vertex) for vertex in vertices)

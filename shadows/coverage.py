@@ -15,6 +15,8 @@ where they do takes the edge's place.
 An edge is seen by the pairs along rows and by those along columns; each counts by the squared
 cosine between the pair and the edge's normal, which add to 1. Summed along an edge, shares
 are then areas, whatever way it runs, and no sudden choice between rows and columns is made.
+Towards a corner of the outline, the cosine goes over into the mean of the edges that meet
+there, so that shares do not jump when a corner passes a row or a column.
 
 What lies between the centres of texels and over none of them is not seen.
 
@@ -36,12 +38,14 @@ from jaxtyping import Array, Float, Int
 
 from tangentspace._math import safe_divide
 
-from ._crossings import Crossings, find_crossings, marked
+from ._crossings import Crossings, Links, find_crossings, link_faces, marked
 from ._fragments import get
 from ._ways import Length, Points, Screen, Ways, edge_crossing, face_plane, place
 from .interpolate import ClipPositions, FaceIds, Faces
 from .rasterize import Raster
 from .silhouettes import MeshEdges
+
+_CORNER = 0.5  # texels from a corner where its own steepness counts
 
 Result = TypeVar("Result")
 
@@ -88,19 +92,24 @@ def coverage(
     screen = Screen.of(clip_positions, faces, *face_ids.shape)
     if face_ids.size == 1:  # no neighbours
         return Coverage(jnp.ones(face_ids.shape, screen.w.dtype), jnp.full_like(face_ids, -1))
-    at_edges, at_lines = find_crossings(lax.stop_gradient(screen), edges, face_ids)
+    links = link_faces(lax.stop_gradient(screen), edges)
+    at_edges, at_lines = find_crossings(lax.stop_gradient(screen), links, face_ids)
+    steepness = _steepness(lax.stop_gradient(screen), links)
     ids, (height, width) = face_ids.reshape(-1), face_ids.shape
-    ends = tuple(jnp.asarray(edges.vertices).T)
 
-    def of_edges(crossings: Crossings, ways: Ways) -> tuple[Length, Length]:
-        a, b = (place(screen, ways, get(end, crossings.by[0])) for end in ends)
+    def of_edges(crossings: Crossings, ways: Ways) -> tuple[Length, Length, Length]:
+        vertices = [get(end, crossings.by[0]) for end in links.vertices]
+        a, b = (place(screen, ways, vertex) for vertex in vertices)
         along = edge_crossing(a, b)
+        steep = _squared_cosine(a.across * b.w - a.w * b.across, a.w * b.along - a.along * b.w)
         still = lax.stop_gradient(along)
         length = _edge_length(*lax.stop_gradient((a, b)), crossings, ways, height)
-        weight = _squared_cosine(a.across * b.w - a.w * b.across, a.w * b.along - a.along * b.w)
-        return still + length * (along - still), weight
+        at_ends = [get(steepness, vertex) for vertex in vertices]
+        at_ends = [jnp.where(ways.side < 2, value, 1 - value) for value in at_ends]
+        near = [_nearness(point, along) for point in (a, b)]
+        return still + length * (along - still), steep, _between(steep, at_ends, near)
 
-    def of_lines(crossings: Crossings, ways: Ways) -> tuple[Length, Length]:
+    def of_lines(crossings: Crossings, ways: Ways) -> tuple[Length, Length, Length]:
         hidden, hidden_there = crossings.by
         plane, behind = (face_plane(screen, ways, f) for f in (get(ids, ways.texel), hidden))
         back = ways.back
@@ -112,7 +121,7 @@ def coverage(
             there.per_along + plane.per_along, there.per_across - plane.per_across
         )
         gap = behind.at(0.0) - plane.at(0.0)
-        return safe_divide(gap, gap + behind_there.at(0.0) - there.at(0.0)), weight
+        return safe_divide(gap, gap + behind_there.at(0.0) - there.at(0.0)), weight, weight
 
     by_side = _rests(of_edges, at_edges, (height, width), 4 * (height + width))
     by_side += _rests(of_lines, at_lines, (height, width), (height + width))
@@ -182,7 +191,7 @@ def blend_layers(
 
 
 def _rests(
-    measure: Callable[[Crossings, Ways], tuple[Length, Length]],
+    measure: Callable[[Crossings, Ways], tuple[Length, Length, Length]],
     crossings: Crossings,
     shape: tuple[int, int],
     few: int,
@@ -190,7 +199,8 @@ def _rests(
     """Return how much of each texel belongs to its neighbour on each side.
 
     Args:
-        measure: Returns how far along its way each crossing is, and its weight.
+        measure: Returns how far along its way each crossing is, its weight in derivatives,
+            and its weight in values.
         crossings: Between texels.
         shape: Of the image.
         few: As many as there usually are.
@@ -201,11 +211,12 @@ def _rests(
     def run(size: int) -> Float[Array, " rests"]:
         texel, side, by = jax.tree.map(lambda values: values[:size], crossings[:3])
         ways = Ways(texel, side, width)
-        along, weight = measure(Crossings(texel, side, by, crossings.total), ways)
+        along, weight, shown = measure(Crossings(texel, side, by, crossings.total), ways)
         along = jnp.clip(along, 0, 1)
         # The texel whose centre is nearer to the crossing is the one that is cut.
         own = lax.stop_gradient(along) < 0.5
-        rest = weight * jnp.where(own, 0.5 - along, along - 0.5)
+        part = jnp.where(own, 0.5 - along, along - 0.5)
+        rest = weight * part + lax.stop_gradient((shown - weight) * part)
         cut = jnp.where(own, side, side ^ 1) * texels + jnp.where(own, texel, ways.other)
         cut = jnp.where(jnp.arange(size) < crossings.total, cut, 4 * texels)
         return jnp.zeros(4 * texels, rest.dtype).at[cut].set(rest, mode="drop")
@@ -256,6 +267,42 @@ def _edge_length(a: Points, b: Points, crossings: Crossings, ways: Ways, height:
         lengths.append(jnp.where((length < 1) | (length < 2) & ~found, length, 0.5))
     long = jnp.abs(ends[0]) + jnp.abs(ends[1]) >= 2
     return jnp.where(long, lengths[0] + lengths[1], 1.0)
+
+
+def _steepness(screen: Screen, links: Links) -> Float[Array, " vertices"]:
+    """Return the mean, over the outline's edges at each vertex, of how upright they are.
+
+    That is the squared cosine between rows and their normals.
+    """
+    a, b = (
+        [get(axis, end) for axis in (screen.column, screen.row, screen.w)] for end in links.vertices
+    )
+    steep = _squared_cosine(a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2])
+    counts = links.outline.astype(steep.dtype)
+
+    def at_vertices(values: Float[Array, " edges"]) -> Float[Array, " vertices"]:
+        total = jnp.zeros_like(screen.w)
+        for end in links.vertices:
+            total = total.at[end].add(values)
+        return total
+
+    return safe_divide(at_vertices(counts * steep), at_vertices(counts))
+
+
+def _nearness(point: Points, along: Length) -> Length:
+    """Return how near a crossing is to a vertex: 1 there, 0 from half a texel."""
+    w = jnp.where(point.w > 0, point.w, 1)
+    squared = (point.along / w - along) ** 2 + (point.across / w) ** 2
+    return jnp.where(point.w > 0, jnp.maximum(1 - squared / _CORNER**2, 0) ** 2, 0.0)
+
+
+def _between(of_edge: Length, at_ends: list[Length], near: list[Length]) -> Length:
+    """Return a mean of an edge's value and those of its ends, which they have for themselves."""
+    away = [1 - x for x in near]
+    parts = [near[0] * away[1], near[1] * away[0], away[0] * away[1]]
+    whole = parts[0] + parts[1] + parts[2]
+    mean = parts[0] * at_ends[0] + parts[1] * at_ends[1] + parts[2] * of_edge
+    return jnp.where(whole > 0, safe_divide(mean, whole), of_edge)
 
 
 def _squared_cosine(along: Length, across: Length) -> Length:

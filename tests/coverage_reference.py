@@ -18,7 +18,8 @@ class CrossingReference(NamedTuple):
         first: Row and column of the texel on the left, or above.
         second: Row and column of the other.
         along: How far it is from the first's centre to the crossing, in [0, 1].
-        weight: Squared cosine between the segment and the outline's normal.
+        weight: Squared cosine between the segment and the outline's normal, near a corner
+            that of its outlines.
     """
 
     first: tuple[int, int]
@@ -42,6 +43,8 @@ def outlines(points: np.ndarray, faces: np.ndarray) -> list[tuple[int, int]]:
     for a, b, c in faces:
         for p, q, r in ((a, b, c), (b, c, a), (c, a, b)):
             key = (min(same[p], same[q]), max(same[p], same[q]))
+            if key[0] == key[1]:
+                continue
             p, q = ends.setdefault(key, (p, q))
             u, v = points[q, :2] - points[p, :2], points[r, :2] - points[p, :2]
             sides.setdefault(key, []).append(np.sign(u[0] * v[1] - u[1] * v[0]))
@@ -75,10 +78,28 @@ def crossings(
         if len(seen) > 1:
             doubtful[row, column] = doubtful[second] = True
             continue
-        normal = (b - a)[seen[0], 1::-1] ** 2
-        weight = normal[axis] / normal.sum()
+        steep = _steep_at(place[seen[0], :2], points[:, :2], edges, seen[0])
+        weight = steep if axis == 0 else 1 - steep
         found.append(CrossingReference((row, column), second, along[seen[0]], weight))
     return found, doubtful
+
+
+def _steep_at(place: np.ndarray, points: np.ndarray, edges: np.ndarray, edge: int) -> float:
+    """Return the squared cosine between rows and an outline's normal, near its corners as there.
+
+    At a corner it is the mean over the outlines that meet there; half a texel away the edge's.
+    """
+    arms = points[edges[:, 1]] - points[edges[:, 0]]
+    steep = arms[:, 1] ** 2 / (arms**2).sum(axis=1)
+    means, near = [], []
+    for end in points[edges[edge]]:
+        meets = (points[edges] == end).all(axis=-1).any(axis=-1)
+        means.append(steep[meets].mean())
+        near.append(max(1 - 4 * ((place - end) ** 2).sum(), 0) ** 2)
+    parts = np.array(
+        [near[0] * (1 - near[1]), near[1] * (1 - near[0]), (1 - near[0]) * (1 - near[1])]
+    )
+    return float(parts @ [*means, steep[edge]] / parts.sum())
 
 
 def shares(found: list[CrossingReference], shape: tuple[int, int]) -> np.ndarray:
