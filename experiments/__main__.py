@@ -37,6 +37,10 @@ def _run(arguments: Sequence[str]) -> int:
     from .baking.bake_command import bake
     from .baking.bake_light_command import bake as bake_light
     from .bias_fits.fit_bias_command import fit as fit_bias
+    from .edge_fits.fit_light_command import fit as fit_light
+    from .edge_fits.fit_pose_command import fit as fit_pose
+    from .edge_fits.fit_vertices_command import fit as fit_vertices
+    from .edge_gradients.derivatives_command import derive
     from .frontier.command import frontier
     from .normal_map_fits.fit_normal_map_command import fit as fit_normal_map
     from .rendering.render_command import render
@@ -48,11 +52,15 @@ def _run(arguments: Sequence[str]) -> int:
         "render": render,
         "fit-bias": fit_bias,
         "fit-normal-map": fit_normal_map,
+        "fit-light": fit_light,
+        "fit-pose": fit_pose,
+        "fit-vertices": fit_vertices,
         "bake-normals": bake,
         "bake-light": bake_light,
         "frontier": frontier,
         "stability": stability,
         "simplest": simplest,
+        "derivatives": derive,
     }
     try:
         _parse(arguments, commands)()

@@ -1,4 +1,4 @@
-"""Pictures and charts of a fitted normal map; colors that survive color blindness and print."""
+"""Pictures and charts in panels; colors that survive color blindness and print."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -9,7 +9,7 @@ import matplotlib.figure
 import numpy as np
 from jaxtyping import Float
 
-from ..files.images import atomic_path, linear_to_srgb
+from .files.images import atomic_path, linear_to_srgb
 
 COLORS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#000000")
 _ERROR_MAP = "viridis"
@@ -59,7 +59,7 @@ class Curve(NamedTuple):
     """How a solver came down.
 
     Attributes:
-        seconds: Run time, without compilation.
+        seconds: Run time, without compilation; or what ``save_curves`` is told.
         errors: At each; mean error in degrees, or what ``save_curves`` is told.
     """
 
@@ -67,7 +67,14 @@ class Curve(NamedTuple):
     errors: Sequence[float]
 
 
-def save_curves(path: Path, curves: Mapping[str, Curve], *, label: str, title: str) -> None:
+def save_curves(
+    path: Path,
+    curves: Mapping[str, Curve],
+    *,
+    label: str,
+    title: str,
+    across: str = "run time without compilation (s)",
+) -> None:
     """Save error against seconds, one line for each solver, on a logarithmic scale."""
     figure = matplotlib.figure.Figure(figsize=(7.5, 5), layout="constrained")
     axes = figure.add_subplot()
@@ -83,7 +90,7 @@ def save_curves(path: Path, curves: Mapping[str, Curve], *, label: str, title: s
             label=name,
         )
     axes.set_yscale("log")
-    axes.set_xlabel("run time without compilation (s)")
+    axes.set_xlabel(across)
     axes.set_ylabel(label)
     axes.grid(color="0.9")
     axes.legend(frameon=False)

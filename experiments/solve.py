@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float, PyTree
 
-from ..files.images import atomic_path
+from .files.images import atomic_path
 
 Objective = Callable[[PyTree, PyTree, PyTree], Float[Array, ""]]
 

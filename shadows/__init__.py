@@ -86,6 +86,7 @@ from .shafts import view_rays as view_rays
 from .silhouettes import MeshEdges as MeshEdges
 from .silhouettes import mesh_edges as mesh_edges
 from .surface import Surface as Surface
+from .surface import mesh_creases as mesh_creases
 from .surface import render_surface as render_surface
 from .surface import surface_coverage as surface_coverage
 from .transforms import Camera as Camera

@@ -84,6 +84,7 @@ class Links(NamedTuple):
         forward: A face that runs forward along an edge; past the last face if there is none.
         backward: A face that runs backward.
         vertices: The two ends of each edge.
+        creases: Where one look of the surface ends and another begins.
     """
 
     edge_ids: tuple[Int[Array, " faces"], ...]
@@ -91,12 +92,13 @@ class Links(NamedTuple):
     forward: Int[Array, " edges"]
     backward: Int[Array, " edges"]
     vertices: tuple[Int[Array, " edges"], ...]
+    creases: Bool[Array, " edges"]
 
     @property
     def outline(self) -> Bool[Array, " edges"]:
-        """Where the surface ends or turns back."""
+        """Where the surface ends or turns back, or its look changes."""
         none = self.edge_ids[0].size
-        return (self.forward == none) != (self.backward == none)
+        return ((self.forward == none) != (self.backward == none)) | self.creases
 
 
 def find_crossings(
@@ -157,7 +159,7 @@ def _put(
     return jax.tree.map(put, kept, values), ends[-1]
 
 
-def link_faces(screen: Screen, edges: MeshEdges) -> Links:
+def link_faces(screen: Screen, edges: MeshEdges, creases: Bool[Array, " edges"] | None) -> Links:
     """Find which faces lie beside each other in the image."""
     edge_ids = jnp.asarray(edges.edge_ids)
     corners = jnp.stack(screen.corners)
@@ -172,7 +174,10 @@ def link_faces(screen: Screen, edges: MeshEdges) -> Links:
         return none.at[jnp.where(chosen, edge_ids, edge_count)].min(face, mode="drop")
 
     ends = tuple(jnp.asarray(edges.vertices).T)
-    return Links(tuple(edge_ids.T), tuple(runs.T), first(runs > 0), first(runs < 0), ends)
+    if creases is None:
+        creases = jnp.zeros(edge_count, bool)
+    parts = first(runs > 0), first(runs < 0), ends, creases
+    return Links(tuple(edge_ids.T), tuple(runs.T), *parts)
 
 
 def _follow(
@@ -210,7 +215,8 @@ def _follow(
         along, edge, run = _leave(screen, links, ways, jnp.maximum(face, 0), walker.came_by)
         next_face = jnp.where(run > 0, get(links.backward, edge), get(links.forward, edge))
         lost = (face < 0) | (run == 0) | (walker.steps >= _STEPS)
-        passed, ended = ~lost & (along > 1), ~lost & (along <= 1) & (next_face == none)
+        ends = (next_face == none) | get(links.creases, edge)
+        passed, ended = ~lost & (along > 1), ~lost & (along <= 1) & ends
         done = (leg >= 0) & (lost | passed | ended)
         end = jnp.where(ended, edge, -1)
         last = jnp.where(passed, face, -1)

@@ -8,7 +8,8 @@ layers at one texel, its own and its neighbour's, and a share.
 
 To find the edge, the surface seen at a texel is followed towards the other, face by face over
 the edges that they share, to the first edge where it ends (an open border) or turns back (a
-silhouette). So it does not matter how small the faces are. Where neither surface ends, but
+silhouette). So it does not matter how small the faces are. In a view that shows colors it also ends
+at a crease, where its shading normal jumps. Where neither surface ends, but
 each lies behind the other at the other's centre, they pass through each other, and the line
 where they do takes the edge's place.
 
@@ -34,7 +35,7 @@ from typing import NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from tangentspace._math import safe_divide
 
@@ -64,7 +65,12 @@ class Coverage(NamedTuple):
 
 
 def coverage(
-    clip_positions: ClipPositions, faces: Faces, edges: MeshEdges, face_ids: FaceIds
+    clip_positions: ClipPositions,
+    faces: Faces,
+    edges: MeshEdges,
+    face_ids: FaceIds,
+    *,
+    creases: Bool[Array, " edges"] | None = None,
 ) -> Coverage:
     """Find the share of each texel that its own surface covers.
 
@@ -73,6 +79,8 @@ def coverage(
         faces: Vertex indices.
         edges: ``mesh_edges(positions, faces)``, found once for a mesh that may move.
         face_ids: What ``rasterize`` found there.
+        creases: Edges at which the surface changes its look, though it goes on
+            (``mesh_creases``): both sides are layers too. None for no edge.
 
     Raises:
         ValueError: If ``edges`` are those of a mesh with another number of faces.
@@ -92,7 +100,7 @@ def coverage(
     screen = Screen.of(clip_positions, faces, *face_ids.shape)
     if face_ids.size == 1:  # no neighbours
         return Coverage(jnp.ones(face_ids.shape, screen.w.dtype), jnp.full_like(face_ids, -1))
-    links = link_faces(lax.stop_gradient(screen), edges)
+    links = link_faces(lax.stop_gradient(screen), edges, creases)
     at_edges, at_lines = find_crossings(lax.stop_gradient(screen), links, face_ids)
     steepness = _steepness(lax.stop_gradient(screen), links)
     ids, (height, width) = face_ids.reshape(-1), face_ids.shape

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from tangentspace._math import dot, safe_normalize
@@ -14,6 +15,8 @@ from .interpolate import ClipPositions, barycentrics, gather_faces, interpolate
 from .rasterize import rasterize
 from .silhouettes import MeshEdges
 from .transforms import Camera, transform_points
+
+_SAME_NORMAL = 1e-3  # difference of normals that makes no crease
 
 
 class Surface(NamedTuple):
@@ -102,4 +105,24 @@ def surface_coverage(mesh: Mesh, camera: Camera, surface: Surface, edges: MeshEd
     """
     height, width = surface.face_ids.shape
     clip = transform_points(camera.clip_from_world(width / height), mesh.positions)
-    return coverage(clip, mesh.faces, edges, surface.face_ids)
+    return coverage(clip, mesh.faces, edges, surface.face_ids, creases=mesh_creases(mesh, edges))
+
+
+def mesh_creases(mesh: Mesh, edges: MeshEdges) -> Bool[Array, " edges"]:
+    """Tell at which edges faces meet with different shading normals.
+
+    Args:
+        mesh: With a normal at each vertex.
+        edges: ``mesh_edges(mesh.positions, mesh.faces)``.
+    """
+    normals, faces = lax.stop_gradient(jnp.asarray(mesh.normals)), jnp.asarray(mesh.faces)
+    start = normals.at[faces].get(mode="clip")
+    end = jnp.roll(start, -1, axis=1)
+    forward = (jnp.asarray(edges.directions) > 0)[..., None]
+    at_ends = jnp.concatenate(
+        [jnp.where(forward, start, end), jnp.where(forward, end, start)], axis=-1
+    )
+    none = jnp.full((edges.vertices.shape[0], 6), jnp.inf, at_ends.dtype)
+    ids = jnp.asarray(edges.edge_ids)
+    least, most = none.at[ids].min(at_ends), (-none).at[ids].max(at_ends)
+    return jnp.any(most - least > _SAME_NORMAL, axis=-1)

@@ -14,7 +14,9 @@ from jax.test_util import check_grads
 from shadows.coverage import blend_layers, coverage, neighbor_depth
 from shadows.rasterize import Raster, rasterize, rasterize_two
 from shadows.silhouettes import mesh_edges
+from shadows.surface import mesh_creases
 from shadows.transforms import look_at, perspective, transform_points
+from tangentspace.mesh import Mesh
 from tangentspace.shapes import box, icosphere, merge, plane, torus, transform_mesh
 
 from .coverage_reference import crossings, screen_points, shares
@@ -370,3 +372,30 @@ def test_shares_jump_less_for_what_corners_have_of_their_own(monkeypatch):
     with_means = jumps()
     monkeypatch.setattr(sys.modules["shadows.coverage"], "_between", lambda of_edge, *_: of_edge)
     assert with_means < 0.7 * jumps()  # measured 0.65 and 1.21
+
+
+def test_creases_are_edges_where_colors_are_shown():
+    """A roof of two sides: what one side covers follows the ridge, if it is said to be one."""
+    faces = np.array([[0, 1, 2], [0, 2, 3], [1, 4, 5], [1, 5, 2]], np.int32)
+    square = np.array([[-0.8, -0.7, 0], [0.1, -0.7, 0], [0.1, 0.7, 0], [-0.8, 0.7, 0],
+                       [0.8, -0.7, 0], [0.8, 0.7, 0]])  # fmt: skip
+    apart = square[faces.reshape(-1)]
+    normals = np.repeat([[-0.6, 0, 0.8], [0.6, 0, 0.8]], 6, axis=0)
+    roof = Mesh(apart, normals, np.arange(12, dtype=np.int32).reshape(4, 3))
+    edges = mesh_edges(roof.positions, roof.faces)
+    creases = mesh_creases(roof, edges)
+    ridge = np.isclose(apart[edges.vertices, 0], 0.1).all(axis=1)
+    np.testing.assert_array_equal(creases, ridge)
+    assert not np.any(mesh_creases(roof._replace(normals=0 * normals + [0, 0, 1.0]), edges))
+    on_ridge = np.isclose(apart[:, 0], 0.1)
+
+    def left(shift, creases):
+        clip = jnp.asarray(flat_clip(apart)).at[:, 0].add(shift * on_ridge)
+        raster = rasterize(clip, roof.faces, image_size=(64, 64))
+        found = coverage(clip, roof.faces, edges, raster.face_ids, creases=creases)
+        seen = (raster.face_ids == 0) | (raster.face_ids == 1)
+        return 4 * jnp.mean(blend_layers(found, seen.astype(clip.dtype)))
+
+    value, change = jax.jit(jax.value_and_grad(left))(0.01, creases)
+    assert float(value) == pytest.approx(0.91 * 1.4, abs=5e-3)
+    assert float(change) == pytest.approx(1.4, rel=0.01)

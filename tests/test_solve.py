@@ -10,8 +10,8 @@ import numpy as np
 import optimistix as optx
 import pytest
 
-import experiments.normal_map_fits.normal_map_solver as solver
-from experiments.normal_map_fits.normal_map_solver import Solve
+import experiments.solve as solver
+from experiments.solve import Solve
 
 SOLVER = optx.LBFGS(rtol=1e-5, atol=1e-5)
 MATRIX = np.array([[3.0, 1.0, 0.2], [1.0, 2.0, -0.4], [0.2, -0.4, 1.5]], np.float32)

@@ -21,9 +21,9 @@ from ..checks import check_out
 from ..console import say, say_table, stage
 from ..files.images import atomic_path
 from ..normal_map_fits.fit_normal_map import SOLVER
-from ..normal_map_fits.normal_map_figures import COLORS, Curve, save_curves
 from ..normal_map_fits.normal_map_study import MapStudy, make_study
 from ..normal_map_fits.normal_map_views import Slopes
+from ..panels import COLORS, Curve, save_curves
 from ..provenance import commit, device, versions
 from ..rendering.prepare_scene import prepare_scene
 from ..scene import Scene

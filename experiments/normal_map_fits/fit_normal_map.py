@@ -26,8 +26,8 @@ from jaxtyping import Array, Float
 from shadows.lights import Light
 from tangentspace.shading import Shading
 
+from ..solve import Solve
 from .normal_map_information import texel_information
-from .normal_map_solver import Solve
 from .normal_map_task import Anchor, Task, Unknowns, free_leaves
 from .normal_map_views import Slopes
 

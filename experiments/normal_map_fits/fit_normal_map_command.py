@@ -1,6 +1,5 @@
 """``python -m experiments fit-normal-map``: a normal map recovered from images."""
 
-import json
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,9 +12,10 @@ import tyro
 
 from ..checks import check_folder, check_scene, check_size, make_folder
 from ..console import say, say_notes, stage
-from ..files.images import atomic_path, read_image
+from ..files.images import read_image
 from ..files.light_file import read_lights
 from ..files.map_files import write_normal_map
+from ..json_file import check_settings, write_json
 from ..provenance import commit, device, versions
 from ..rendering.prepare_scene import prepare_scene
 from ..rendering.render_command import SceneName
@@ -126,11 +126,11 @@ def fit(
     with stage("compiling"):
         under_way = MapFit(task, study.shading, study.lights, free=free)
         if resume:
-            _check_settings(out / "settings.json", settings)
+            check_settings(out / "settings.json", settings)
             under_way.restore(out / "state.eqx")
         under_way.advance(0)
     compile_seconds = time.perf_counter() - start
-    _write_json(out / "settings.json", settings)
+    write_json(out / "settings.json", settings)
     history = _run(under_way, task, study, out, steps)
     unknowns = under_way.unknowns
     with stage("judging and drawing"):
@@ -140,7 +140,7 @@ def fit(
         write_results(out, study, task, (under_way.start, unknowns), evidence, history)
     seconds = {"fit": history[-1]["seconds"], "compile": compile_seconds}
     made_with = {"versions": versions(), "device": device(), "commit": commit()}
-    _write_json(
+    write_json(
         out / "summary.json", {"settings": settings, **summary, "seconds": seconds, **made_with}
     )
     tell(study, summary, seconds)
@@ -168,20 +168,6 @@ def _check_options(
         raise ValueError(f"--shadow-margin: expected at least 0 pixels, got {shadow_margin}")
     if steps < 1:
         raise ValueError(f"--steps: expected at least 1, got {steps}")
-
-
-def _check_settings(path: Path, settings: Mapping[str, Any]) -> None:
-    """Refuse to go on with a fit of other settings."""
-    try:
-        stored = json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError) as error:
-        raise ValueError(f"--resume: {path} cannot be read ({error}); start anew") from error
-    other = [name for name, value in settings.items() if stored.get(name) != value]
-    if other:
-        raise ValueError(
-            f"--resume: the stopped fit had other settings ({', '.join(other)}); "
-            f"give the same ones, or start anew"
-        )
 
 
 def _run(
@@ -255,8 +241,3 @@ def _summary(
                 "max": float(picked.max()) if picked.size else None,
             }
     return summary
-
-
-def _write_json(path: Path, content: Mapping[str, Any]) -> None:
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=2) + "\n", "utf-8")

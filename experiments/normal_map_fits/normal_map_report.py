@@ -11,8 +11,8 @@ from jaxtyping import Float
 from ..console import say, say_table
 from ..files.images import write_exr
 from ..files.map_files import write_normal_map
+from ..panels import Curve, Panel, save_curves, save_panels, shown
 from .normal_map_evidence import ENOUGH_LIGHTS, Evidence
-from .normal_map_figures import Curve, Panel, save_curves, save_panels, shown
 from .normal_map_study import MapStudy, errors_of, texels_of
 from .normal_map_task import Task, Unknowns
 

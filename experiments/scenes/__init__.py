@@ -62,6 +62,19 @@ def spot() -> Scene:
     return staged("spot", [plane(2.5), ball, wall], eye=(1.8, 2.2, 3.0), light=light)
 
 
+def bracket() -> Scene:
+    """A bracket of three bars that hovers over a floor: its shadow tells how it is turned."""
+    bars = [
+        placed(box((0.4, 0.06, 0.08)), (0.0, 0.9, 0.0)),
+        placed(box((0.07, 0.05, 0.25)), (-0.33, 0.9, 0.33)),
+        placed(box((0.06, 0.2, 0.06)), (0.32, 1.12, -0.1)),
+    ]
+    position = np.array([0.5, 3.4, 0.9], np.float32)
+    direction = -position / np.linalg.norm(position)
+    light = SpotLight(position, direction.astype(np.float32), inner_angle=0.5, outer_angle=0.8)
+    return staged("bracket", [plane(1.8), *bars], eye=(0.2, 2.4, 2.6), light=light)
+
+
 def default() -> Scene:
     """Low light over a ball, a wall and sheets hardly thicker than the bias that acne asks for."""
     ball = placed(icosphere(0.45, subdivisions=4), (-0.75, 0.45, -0.35))
@@ -82,6 +95,7 @@ SHADOW_SCENES: dict[str, Callable[[], Scene]] = {
     "sphere": sphere,
     "stacked": stacked,
     "spot": spot,
+    "bracket": bracket,
 }
 MAPPED_SCENES: dict[str, Callable[[], Scene]] = {
     "bumpy": bumpy,
