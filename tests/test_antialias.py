@@ -60,7 +60,7 @@ def test_maps_of_a_cube_have_derivatives_at_edges(scene):
     edges = mesh_edges(mesh.positions, mesh.faces)
     moving = (mesh.positions[:, 1:2] > 1e-3).astype(np.float32) * np.float32([1, 0, 0])
 
-    def mean(shift, edges, image_size=64, map_size=256):
+    def mean(shift, edges, image_size=128, map_size=256):
         image = render(
             mesh._replace(positions=mesh.positions + shift * moving), scene.camera, light,
             image_size=(image_size, image_size), map_size=map_size, layout=CubeLayout(),
@@ -72,6 +72,7 @@ def test_maps_of_a_cube_have_derivatives_at_edges(scene):
     change = jax.jit(lambda edges: jax.jvp(lambda x: mean(x, edges), (zero,), (one,))[1])
     fine = jax.jit(lambda shift: mean(shift, None, 384, 512))
     difference = float(fine(0.04) - fine(-0.04)) / 0.08
+    # With 64 pixels on a side, of which the box's creases are few, it is 28 % off.
     assert float(change(edges)) == pytest.approx(difference, rel=0.1)
     assert abs(float(change(None)) - difference) > 0.3 * abs(difference)
 
