@@ -20,6 +20,7 @@ from .silhouettes import MeshEdges
 _PIECE = 2**11  # ways looked at together
 _STEPS = 64  # faces that are followed from a texel to its neighbour
 _EQUAL = 2.0**-16  # window depths so close are the same
+_APART = 2.0**-19  # what surfaces that cross part by between two texels; rounding is a fourth of it
 
 
 class Crossings(NamedTuple):
@@ -219,7 +220,7 @@ def _follow(
         passed, ended = ~lost & (along > 1), ~lost & (along <= 1) & ends
         done = (leg >= 0) & (lost | passed | ended)
         end = jnp.where(ended, edge, -1)
-        last = jnp.where(passed, face, -1)
+        last = jnp.where(passed | ended, face, -1)
 
         both = _Walks(pair, (walker.end, end), (walker.last, last))
         walks, count = _put(walks, both, done & (leg == 1), count)
@@ -284,19 +285,18 @@ def _meet(
     seen_there = jnp.concatenate([other, face])
     along, depth = _edge_depth(screen, links, both, jnp.maximum(edge, 0))
     surface = face_plane(screen, both, seen_there).at(along)
-    there, back_there = jnp.split(
-        (edge >= 0) & ~((seen_there >= 0) & (depth > surface + _EQUAL)), 2
-    )
+    seen = (edge >= 0) & ~((seen_there >= 0) & (depth > surface + _EQUAL))
+    there, back_there = jnp.split(seen, 2)
     nearer = back_there & (~there | (jnp.less(*jnp.split(depth, 2)[::-1])))
     found = [jnp.where(nearer, *jnp.split(x, 2)[::-1]) for x in (texel, side, edge)]
     at_edges = Crossings(found[0], found[1], (found[2],), there | back_there)
-    # Neither ends before the other's centre, and they are not one surface.
+    # Neither is seen to end before the other's centre, and they are not one surface.
     last, back_last = walks.last
     apart = (last >= 0) & (back_last >= 0) & (last != other) & (back_last != face)
     here = face_plane(screen, ways, back_last).at(0.0) - face_plane(screen, ways, face).at(0.0)
     beyond = face_plane(screen, back, last).at(0.0) - face_plane(screen, back, other).at(0.0)
-    cross = apart & (here >= 0) & (beyond >= 0) & (here + beyond > _EQUAL)
-    return at_edges, Crossings(ways.texel, ways.side, (back_last, last), cross)
+    cross = apart & (here >= 0) & (beyond >= 0) & (here + beyond > _APART)
+    return at_edges, Crossings(ways.texel, ways.side, (back_last, last), cross & ~at_edges.total)
 
 
 def _edge_depth(screen: Screen, links: Links, ways: Ways, edge: Index) -> tuple[Length, Length]:

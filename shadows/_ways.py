@@ -137,3 +137,26 @@ def face_plane(screen: Screen, ways: Ways, face: Index) -> FacePlane:
     nearest, farthest = (functools.reduce(f, each) for f in (jnp.minimum, jnp.maximum))
     depth, per_along, per_across = (safe_divide(x, w) for x in (depth, per_along, per_across))
     return FacePlane(depth, per_along, per_across, nearest, farthest)
+
+
+def line_planes(
+    screen: Screen, ways: Ways, hidden: tuple[Index, ...], face_ids: Int[Array, " texels"]
+) -> tuple[tuple[FacePlane, FacePlane], ...]:
+    """Return, at both ends of each way, the planes of the face seen and of the one behind it.
+
+    Args:
+        screen: The mesh in the image.
+        ways: Between texels that see surfaces which pass through each other.
+        hidden: The faces behind, at the start and at the end.
+        face_ids: The face seen at each texel.
+    """
+    return tuple(
+        (face_plane(screen, way, get(face_ids, way.texel)), face_plane(screen, way, behind))
+        for way, behind in zip((ways, ways.back), hidden, strict=True)
+    )
+
+
+def line_crossing(here: tuple[FacePlane, FacePlane], there: tuple[FacePlane, FacePlane]) -> Length:
+    """Return how far along the way the surfaces of ``line_planes`` pass through each other."""
+    gap, gap_there = (behind.at(0.0) - seen.at(0.0) for seen, behind in (here, there))
+    return safe_divide(gap, gap + gap_there)

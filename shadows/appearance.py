@@ -7,11 +7,12 @@ import functools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from tangentspace._math import dot
+from tangentspace._math import dot, safe_normalize
 from tangentspace.material import Material, MippedTexture, look_up_texture
 from tangentspace.mesh import Mesh
 from tangentspace.mips import texel_footprint
@@ -21,6 +22,7 @@ from tangentspace.pixel_frame import perturb_normal
 from tangentspace.shading import Shading
 from tangentspace.texture import Texture
 
+from .edge_points import EdgePoints
 from .interpolate import barycentric_slopes, gather_faces, interpolate
 from .surface import Surface
 from .transforms import Camera, transform_points
@@ -92,6 +94,26 @@ def surface_appearance(
     places = _Places(mesh, camera, surface)
     normal, coherence = _normals(mesh, surface, regions, places)
     return Appearance(normal, _colors(surface, regions, places), coherence, _reflectivity(regions))
+
+
+def edge_appearance(
+    appearance: Appearance, surface: Surface, sides: Surface, points: EdgePoints
+) -> Appearance:
+    """Return how the surfaces on both sides of edges look.
+
+    Args:
+        appearance: Of the pixels.
+        surface: What the eye sees.
+        sides: ``edge_surface(mesh, camera, surface, points)``.
+        points: On edges.
+
+    Returns:
+        As at the centres of the pixels beside the edge, but with normals turned as the
+        surface's are from there to the edge.
+    """
+    look = jax.tree.map(points.beside, appearance)
+    change = sides.normal - points.beside(surface.normal)
+    return look._replace(normal=safe_normalize(look.normal + change))
 
 
 class _Places:

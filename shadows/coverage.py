@@ -41,7 +41,18 @@ from tangentspace._math import safe_divide
 
 from ._crossings import Crossings, Links, find_crossings, link_faces, marked
 from ._fragments import get
-from ._ways import Length, Points, Screen, Ways, edge_crossing, face_plane, place
+from ._ways import (
+    Index,
+    Length,
+    Points,
+    Screen,
+    Ways,
+    edge_crossing,
+    face_plane,
+    line_crossing,
+    line_planes,
+    place,
+)
 from .interpolate import ClipPositions, FaceIds, Faces
 from .rasterize import Raster
 from .silhouettes import MeshEdges
@@ -52,16 +63,29 @@ Result = TypeVar("Result")
 
 
 class Coverage(NamedTuple):
-    """Two layers at each texel: its own, and that of a neighbour.
+    """The layers at each texel: its own, and those of the neighbours that reach into it.
 
     Attributes:
-        share: Of the texel, covered by its own layer, in [0, 1].
-        side: Where the neighbour lies whose layer covers the rest: 0 to the right, 1 to the
-            left, 2 below, 3 above; -1 where the texel's own layer covers all.
+        rests: How much of the texel belongs to the layers of the neighbours to the right, to
+            the left, below and above; together more than 1 where it is crowded.
+        crossings: Edges between texels, and lines where surfaces pass through each other.
     """
 
-    share: Float[Array, "height width"]
-    side: Int[Array, "height width"]
+    rests: Float[Array, "4 height width"]
+    crossings: tuple[Crossings, Crossings]
+
+    @property
+    def share(self) -> Float[Array, "height width"]:
+        """How much of the texel its own layer covers, in [0, 1]."""
+        right, left, below, above = self.rests
+        return jnp.maximum(1 - (right + left) - (below + above), 0)
+
+    @property
+    def side(self) -> Int[Array, "height width"]:
+        """Which neighbour's layer covers most of the rest; -1 where there is no rest."""
+        rests = lax.stop_gradient(self.rests)
+        widest = jnp.argmax(rests, axis=0).astype(jnp.int32)
+        return jnp.where(jnp.any(rests > 0, axis=0), widest, -1)
 
 
 def coverage(
@@ -98,8 +122,6 @@ def coverage(
             f"{edges.edge_ids.shape[0]}; pass mesh_edges(positions, faces)"
         )
     screen = Screen.of(clip_positions, faces, *face_ids.shape)
-    if face_ids.size == 1:  # no neighbours
-        return Coverage(jnp.ones(face_ids.shape, screen.w.dtype), jnp.full_like(face_ids, -1))
     links = link_faces(lax.stop_gradient(screen), edges, creases)
     at_edges, at_lines = find_crossings(lax.stop_gradient(screen), links, face_ids)
     steepness = _steepness(lax.stop_gradient(screen), links)
@@ -110,32 +132,23 @@ def coverage(
         a, b = (place(screen, ways, vertex) for vertex in vertices)
         along = edge_crossing(a, b)
         steep = _squared_cosine(a.across * b.w - a.w * b.across, a.w * b.along - a.along * b.w)
-        still = lax.stop_gradient(along)
         length = _edge_length(*lax.stop_gradient((a, b)), crossings, ways, height)
         at_ends = [get(steepness, vertex) for vertex in vertices]
         at_ends = [jnp.where(ways.side < 2, value, 1 - value) for value in at_ends]
         near = [_nearness(point, along) for point in (a, b)]
-        return still + length * (along - still), steep, _between(steep, at_ends, near)
+        return _with_rate(along, length), steep, _between(steep, at_ends, near)
 
     def of_lines(crossings: Crossings, ways: Ways) -> tuple[Length, Length, Length]:
-        hidden, hidden_there = crossings.by
-        plane, behind = (face_plane(screen, ways, f) for f in (get(ids, ways.texel), hidden))
-        back = ways.back
-        there, behind_there = (
-            face_plane(screen, back, f) for f in (get(ids, back.texel), hidden_there)
-        )
+        here, there = line_planes(screen, ways, crossings.by, ids)
         # Seen from there, along is the other way round, across is not.
         weight = _squared_cosine(
-            there.per_along + plane.per_along, there.per_across - plane.per_across
+            there[0].per_along + here[0].per_along, there[0].per_across - here[0].per_across
         )
-        gap = behind.at(0.0) - plane.at(0.0)
-        return safe_divide(gap, gap + behind_there.at(0.0) - there.at(0.0)), weight, weight
+        return line_crossing(here, there), weight, weight
 
-    by_side = _rests(of_edges, at_edges, (height, width), 4 * (height + width))
-    by_side += _rests(of_lines, at_lines, (height, width), (height + width))
-    share = jnp.maximum(1 - (by_side[0] + by_side[1]) - (by_side[2] + by_side[3]), 0)
-    widest = jnp.argmax(lax.stop_gradient(by_side), axis=0).astype(jnp.int32)
-    return Coverage(share, jnp.where(lax.stop_gradient(share) < 1, widest, -1))
+    rests = _rests(of_edges, at_edges, (height, width), 4 * (height + width))
+    rests += _rests(of_lines, at_lines, (height, width), (height + width))
+    return Coverage(rests, (at_edges, at_lines))
 
 
 def neighbor_depth(
@@ -173,29 +186,55 @@ def neighbor_depth(
 
 
 def blend_layers(
-    coverage: Coverage, image: Float[Array, "height width *channels"]
+    coverage: Coverage,
+    image: Float[Array, "height width *channels"],
+    *,
+    changes: Float[Array, "4 height width *channels"] | None = None,
 ) -> Float[Array, "height width *channels"]:
-    """Return each texel's value with that of its neighbour, by the shares of their layers.
+    """Return each texel's value with those of its neighbours, by the shares of their layers.
 
     Args:
         coverage: Of the image.
         image: Values of each texel's own layer, such as colors.
+        changes: For derivatives: by how much more the neighbour's value exceeds the texel's
+            own at the edge between them than at the centres (``edge_changes``). None for 0.
 
     Returns:
-        Between those of the texel and the neighbour: an antialiased image.
+        Between those of the texel and its neighbours: an antialiased image.
 
     Differentiability:
         In the shares and the values.
     """
-    per_texel = image.shape[:2] + (1,) * (image.ndim - 2)
-    share, side = coverage.share.reshape(per_texel), coverage.side.reshape(per_texel)
-    padded = jnp.pad(image, [(1, 1), (1, 1)] + [(0, 0)] * (image.ndim - 2))
-    height, width = image.shape[:2]
-    other = image
-    for k, (row, column) in enumerate(((1, 2), (1, 0), (2, 1), (0, 1))):
-        beside = padded[row : row + height, column : column + width]
-        other = jnp.where(side == k, beside, other)
-    return share * image + (1 - share) * other
+    height, width, *channels = image.shape
+    rests = coverage.rests / jnp.maximum(jnp.sum(coverage.rests, axis=0), 1)
+    rests = rests.reshape(4, height, width, *(1 for _ in channels))
+    padded = jnp.pad(image, [(1, 1), (1, 1)] + [(0, 0)] * len(channels))
+    blended = (1 - (rests[0] + rests[1]) - (rests[2] + rests[3])) * image
+    for rest, (row, column) in zip(rests, ((1, 2), (1, 0), (2, 1), (0, 1)), strict=True):
+        blended += rest * padded[row : row + height, column : column + width]
+    return blended if changes is None else _with_changes(blended, rests, changes)
+
+
+@jax.custom_jvp
+def _with_changes(blended: Array, rests: Array, changes: Array) -> Array:
+    """Return a blended image whose derivative in the rests is more by the changes."""
+    return blended
+
+
+@_with_changes.defjvp
+def _(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Array, Array]:
+    blended, _, changes = primals
+    return blended, tangents[0] + jnp.sum(tangents[1] * changes, axis=0)
+
+
+def cut_texel(ways: Ways, along: Length, height: int) -> tuple[Bool[Array, " ways"], Index]:
+    """Return whether crossings cut the texels where the ways begin, and which rests they bound.
+
+    The texel whose centre is nearer is the one that is cut.
+    """
+    own = along < 0.5
+    side, texel = jnp.where(own, ways.side, ways.side ^ 1), jnp.where(own, ways.texel, ways.other)
+    return own, side * height * ways.width + texel
 
 
 def _rests(
@@ -203,7 +242,7 @@ def _rests(
     crossings: Crossings,
     shape: tuple[int, int],
     few: int,
-) -> Float[Array, "sides=4 height width"]:
+) -> Float[Array, "4 height width"]:
     """Return how much of each texel belongs to its neighbour on each side.
 
     Args:
@@ -221,11 +260,9 @@ def _rests(
         ways = Ways(texel, side, width)
         along, weight, shown = measure(Crossings(texel, side, by, crossings.total), ways)
         along = jnp.clip(along, 0, 1)
-        # The texel whose centre is nearer to the crossing is the one that is cut.
-        own = lax.stop_gradient(along) < 0.5
+        own, cut = cut_texel(ways, lax.stop_gradient(along), height)
         part = jnp.where(own, 0.5 - along, along - 0.5)
         rest = weight * part + lax.stop_gradient((shown - weight) * part)
-        cut = jnp.where(own, side, side ^ 1) * texels + jnp.where(own, texel, ways.other)
         cut = jnp.where(jnp.arange(size) < crossings.total, cut, 4 * texels)
         return jnp.zeros(4 * texels, rest.dtype).at[cut].set(rest, mode="drop")
 
@@ -240,6 +277,18 @@ def _few_or_all(run: Callable[[int], Result], count: Int[Array, ""], few: int, m
     # Computed again backwards: what is kept of a choice is as large as its largest way.
     ways = (jax.checkpoint(functools.partial(run, size)) for size in (few, most))
     return lax.cond(count <= few, *ways)
+
+
+@jax.custom_jvp
+def _with_rate(value: Length, rate: Length) -> Length:
+    """Return a value whose derivatives count ``rate`` times; the rate is not asked without."""
+    return value
+
+
+@_with_rate.defjvp
+def _(primals: tuple[Length, Length], tangents: tuple[Length, Length]) -> tuple[Length, Length]:
+    value, rate = primals
+    return value, rate * tangents[0]
 
 
 def _edge_length(a: Points, b: Points, crossings: Crossings, ways: Ways, height: int) -> Length:

@@ -35,7 +35,11 @@ def pixel_centers(
 
 
 def barycentrics(
-    clip_positions: ClipPositions, faces: Faces, face_ids: FaceIds
+    clip_positions: ClipPositions,
+    faces: Faces,
+    face_ids: FaceIds,
+    *,
+    points: tuple[Float[Array, "*x"], Float[Array, "*y"]] | None = None,
 ) -> Float[Array, "height width 3"]:
     """Return perspective-correct barycentric weights of each pixel centre in its face.
 
@@ -43,6 +47,8 @@ def barycentrics(
         clip_positions: Vertices in clip space.
         faces: Vertex indices.
         face_ids: Face at each pixel, -1 where there is none, as ``rasterize`` returns it.
+        points: NDC x and y of each pixel's point, if it is not the centre: shapes that
+            broadcast to that of the face ids. Beyond a face its border counts.
 
     Returns:
         Weights that are not negative and sum to 1; all 0 where no face is. A face of zero
@@ -52,7 +58,7 @@ def barycentrics(
         Smooth in ``clip_positions`` inside a face; zero where no face is, and at the
         weights of a face of zero area.
     """
-    areas, _, reach = _edge_functions(clip_positions, faces, face_ids)
+    areas, _, reach = _edge_functions(clip_positions, faces, face_ids, points)
     flat = areas[0] + areas[1] + areas[2] <= jnp.finfo(reach.dtype).eps * reach**2
     # Rounding may put a centre outside its face: no weight is negative, but the derivative
     # stays that of the plane.
@@ -141,14 +147,20 @@ def _face_corners(faces: Faces, face_ids: FaceIds) -> list[Int[Array, "height wi
 
 
 def _edge_functions(
-    clip_positions: ClipPositions, faces: Faces, face_ids: FaceIds
+    clip_positions: ClipPositions,
+    faces: Faces,
+    face_ids: FaceIds,
+    points: tuple[Array, Array] | None = None,
 ) -> tuple[list[Array], tuple[list[Array], list[Array]], Array]:
     """Return what the weights are shares of, its slopes in NDC x and y, and the rays' size.
 
     All are turned so that a face seen from behind has positive areas too.
     """
-    height, width = face_ids.shape
-    x, y = pixel_centers(height, width, clip_positions.dtype)
+    if points is None:
+        height, width = face_ids.shape
+        x, y = pixel_centers(height, width, clip_positions.dtype)
+        points = x, y[:, None]
+    x, y = points
     covered = face_ids >= 0
     columns = jnp.asarray(clip_positions).T
     rays = []
@@ -157,7 +169,7 @@ def _edge_functions(
         vertex_x, vertex_y, w = (
             jnp.where(covered, columns[axis].at[corner].get(mode="clip"), 1) for axis in (0, 1, 3)
         )
-        rays.append((vertex_x - x * w, vertex_y - y[:, None] * w, w))
+        rays.append((vertex_x - x * w, vertex_y - y * w, w))
     pairs = [(rays[i], rays[j]) for i, j in ((1, 2), (2, 0), (0, 1))]
     areas = [a[0] * b[1] - a[1] * b[0] for a, b in pairs]
     facing = jnp.where(areas[0] + areas[1] + areas[2] < 0, -1, 1).astype(x.dtype)

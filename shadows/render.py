@@ -6,10 +6,12 @@ What depends on the eye (``Surface``, ``Appearance``) and what depends on a ligh
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float, Int, PyTree
 
 from tangentspace._math import dot
@@ -19,21 +21,23 @@ from tangentspace.material import Material
 from tangentspace.mesh import Mesh
 from tangentspace.shading import BlinnPhongShading, Shading
 
-from .appearance import Appearance, surface_appearance
+from .appearance import Appearance, edge_appearance, surface_appearance
 from .bias import AnalyticBias, Bias, CombinedBias
 from .compare import Compare, HardCompare
 from .coverage import Coverage, blend_layers
+from .edge_points import EdgePoints, edge_changes
 from .filters import Filter
 from .layouts import Layout, SingleLayout
 from .lights import Light
 from .plane_bias import AdaptiveBias
 from .shadow_map import Receiver, ShadowMap, choose_map, receive, render_shadow_map
 from .silhouettes import MeshEdges
-from .surface import Surface, render_surface, surface_coverage
-from .transforms import Camera, Scalar
+from .surface import Surface, edge_surface, mesh_creases, render_surface, surface_coverage
+from .transforms import Camera, Scalar, transform_points
 from .volumes import volume_visibility
 from .window_filters import BilinearFilter
 
+Tree = TypeVar("Tree")
 Visibility = Float[Array, "height width"]
 
 
@@ -267,6 +271,10 @@ def render(
         expected = f"expected one of `shadow_maps` for each of {len(lights)} lights"
         raise ValueError(f"render: {expected}, got {len(shadow_maps)}")
     surface = render_surface(mesh, camera, image_size=image_size)
+    prepared = [
+        filter.for_light(light).prepare(bias.prepare(shadow_map))
+        for light, shadow_map in zip(lights, shadow_maps, strict=False)
+    ]
     if not cast_shadows:
         visibilities = tuple(facing_visibility(surface, light) for light in lights)
     elif volume_edges is not None:
@@ -276,9 +284,9 @@ def render(
     else:
         visibilities = tuple(
             surface_visibility(
-                surface, light, shadow_map, bias=bias, filter=filter, compare=compare
+                surface, light, drawn, bias=bias, filter=filter, compare=compare, prepared=kept
             )
-            for light, shadow_map in zip(lights, shadow_maps, strict=True)
+            for light, drawn, kept in zip(lights, shadow_maps, prepared, strict=True)
         )
     appearance = surface_appearance(mesh, camera, surface, materials, face_materials=face_materials)
     color = shade(
@@ -293,8 +301,72 @@ def render(
         height, width = image_size
         sky = skybox(environment, camera.clip_from_world(width / height), height, width)
         color = jnp.where(surface.covered[..., None], color, sky)
-    covers = None
-    if edges is not None:
-        covers = surface_coverage(mesh, camera, surface, edges)
-        color = blend_layers(covers, color)
-    return Rendering(color, visibilities, surface, appearance, tuple(shadow_maps), covers)
+    image = Rendering(color, visibilities, surface, appearance, tuple(shadow_maps))
+    if edges is None:
+        return image
+    covers = surface_coverage(mesh, camera, surface, edges)
+    still = (mesh, camera, lights, prepared, bias, filter, compare, environment, shading)
+    changes = _edge_changes(*_still((image, covers, edges, *still)))
+    return image._replace(color=blend_layers(covers, color, changes=changes), coverage=covers)
+
+
+def _edge_changes(
+    image: Rendering,
+    coverage: Coverage,
+    edges: MeshEdges,
+    mesh: Mesh,
+    camera: Camera,
+    lights: Sequence[Light],
+    prepared: Sequence[PyTree],
+    bias: Bias,
+    filter: Filter,
+    compare: Compare,
+    environment: CubeMap | None,
+    shading: Shading,
+) -> Float[Array, "4 height width 3"]:
+    """Return what ``blend_layers`` asks of an image: its colors are looked up again at edges."""
+    surface, maps = image.surface, image.shadow_maps
+
+    def look(points: EdgePoints) -> Float[Array, "2 points 3"]:
+        sides = edge_surface(mesh, camera, surface, points)
+        visibilities = [points.beside(visible) for visible in image.visibilities]
+        if maps:
+            looked_up = [
+                surface_visibility(
+                    sides, light, drawn, bias=bias, filter=filter, compare=compare, prepared=kept
+                )
+                for light, drawn, kept in zip(lights, maps, prepared, strict=True)
+            ]
+            # Where two surfaces meet, a map tells of both at once; beside the edge it does not.
+            visibilities = [
+                jnp.where(points.ends, there, near)
+                for there, near in zip(looked_up, visibilities, strict=True)
+            ]
+        color = shade(
+            sides,
+            lights,
+            visibilities,
+            appearance=edge_appearance(image.appearance, surface, sides, points),
+            environment=environment,
+            shading=shading,
+        )
+        return jnp.where(sides.covered[..., None], color, points.beside(image.color))
+
+    height, width = surface.face_ids.shape
+    clip = transform_points(camera.clip_from_world(width / height), mesh.positions)
+    return edge_changes(
+        clip,
+        mesh.faces,
+        edges,
+        surface.face_ids,
+        coverage,
+        image.color,
+        look,
+        creases=mesh_creases(mesh, edges),
+    )
+
+
+def _still(tree: Tree) -> Tree:
+    """Return the same without derivatives."""
+    moving, rest = eqx.partition(tree, eqx.is_inexact_array)
+    return eqx.combine(lax.stop_gradient(moving), rest)

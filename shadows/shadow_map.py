@@ -108,7 +108,6 @@ def render_shadow_map(
             f"render_shadow_map: expected `casters` nearest, back or two, got {casters!r}"
         )
     positions, size = jnp.asarray(positions), (map_size, map_size)
-
     steady = None if edges is None else main_plane(positions, faces)
 
     def one(matrix: Float[Array, "4 4"]) -> ShadowMap:
@@ -120,12 +119,13 @@ def render_shadow_map(
             rasters = rasterize_two(clip, faces, image_size=size)
         else:
             rasters = (rasterize(clip, faces, image_size=size, cull_front=casters == "back"),)
-        depth, second = (rasters[0].depth, rasters[1].depth if len(rasters) > 1 else None)
+        depth, *others = (raster.depth for raster in rasters)
+        second = others[0] if others else None
         if edges is None:
             return ShadowMap(depth, matrix, second)
         covers = coverage(clip, faces, edges, rasters[0].face_ids)
-        others = (neighbor_depth(clip, faces, covers, raster) for raster in rasters)
-        return ShadowMap(depth, matrix, second, NeighborLayer(covers.share, *others))
+        depths = (neighbor_depth(clip, faces, covers, raster) for raster in rasters)
+        return ShadowMap(depth, matrix, second, NeighborLayer(covers.share, *depths))
 
     matrix = jnp.asarray(clip_from_world)
     if matrix.ndim == 2:

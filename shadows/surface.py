@@ -11,7 +11,8 @@ from tangentspace.mesh import Mesh
 from tangentspace.vertex_normals import face_normals
 
 from .coverage import Coverage, coverage
-from .interpolate import ClipPositions, barycentrics, gather_faces, interpolate
+from .edge_points import EdgePoints
+from .interpolate import ClipPositions, FaceIds, barycentrics, gather_faces, interpolate
 from .rasterize import rasterize
 from .silhouettes import MeshEdges
 from .transforms import Camera, transform_points
@@ -59,13 +60,7 @@ def render_surface(mesh: Mesh, camera: Camera, *, image_size: tuple[int, int]) -
     """
     matrix = camera.clip_from_world(image_size[1] / image_size[0])
     seen = surface_at(mesh, transform_points(matrix, mesh.positions), image_size=image_size)
-    to_camera = camera.to_camera(seen.position)
-    away = (dot(seen.face_normal, to_camera) < 0)[..., None]
-    return seen._replace(
-        face_normal=jnp.where(away, -seen.face_normal, seen.face_normal),
-        normal=jnp.where(away, -seen.normal, seen.normal),
-        to_camera=to_camera,
-    )
+    return _turned(camera, seen)
 
 
 def surface_at(mesh: Mesh, clip: ClipPositions, *, image_size: tuple[int, int]) -> Surface:
@@ -79,13 +74,35 @@ def surface_at(mesh: Mesh, clip: ClipPositions, *, image_size: tuple[int, int]) 
     Returns:
         With normals as the faces are wound, and ``to_camera`` along the shading normal.
     """
+    raster = rasterize(clip, jnp.asarray(mesh.faces), image_size=image_size)
+    return _interpolated(mesh, clip, raster.face_ids, raster.depth)
+
+
+def _interpolated(
+    mesh: Mesh,
+    clip: ClipPositions,
+    face_ids: FaceIds,
+    depth: Float[Array, "height width"],
+    points: tuple[Array, Array] | None = None,
+) -> Surface:
+    """Return the surface of known faces, at pixels' centres or at other points."""
     positions, faces = jnp.asarray(mesh.positions), jnp.asarray(mesh.faces)
-    raster = rasterize(clip, faces, image_size=image_size)
-    weights = barycentrics(clip, faces, raster.face_ids)
-    position = interpolate(positions, faces, raster.face_ids, weights)
-    normal = safe_normalize(interpolate(mesh.normals, faces, raster.face_ids, weights))
-    face_normal = gather_faces(face_normals(positions, faces), raster.face_ids)
-    return Surface(raster.face_ids, raster.depth, position, face_normal, normal, normal, weights)
+    weights = barycentrics(clip, faces, face_ids, points=points)
+    position = interpolate(positions, faces, face_ids, weights)
+    normal = safe_normalize(interpolate(mesh.normals, faces, face_ids, weights))
+    face_normal = gather_faces(face_normals(positions, faces), face_ids)
+    return Surface(face_ids, depth, position, face_normal, normal, normal, weights)
+
+
+def _turned(camera: Camera, seen: Surface) -> Surface:
+    """Turn normals to the camera's side."""
+    to_camera = camera.to_camera(seen.position)
+    away = (dot(seen.face_normal, to_camera) < 0)[..., None]
+    return seen._replace(
+        face_normal=jnp.where(away, -seen.face_normal, seen.face_normal),
+        normal=jnp.where(away, -seen.normal, seen.normal),
+        to_camera=to_camera,
+    )
 
 
 def surface_coverage(mesh: Mesh, camera: Camera, surface: Surface, edges: MeshEdges) -> Coverage:
@@ -106,6 +123,31 @@ def surface_coverage(mesh: Mesh, camera: Camera, surface: Surface, edges: MeshEd
     height, width = surface.face_ids.shape
     clip = transform_points(camera.clip_from_world(width / height), mesh.positions)
     return coverage(clip, mesh.faces, edges, surface.face_ids, creases=mesh_creases(mesh, edges))
+
+
+def edge_surface(mesh: Mesh, camera: Camera, surface: Surface, points: EdgePoints) -> Surface:
+    """Return what is seen on both sides of edges, right at them, as an image of two rows.
+
+    Args:
+        mesh: World space.
+        camera: The view.
+        surface: What it sees of the mesh.
+        points: On edges of the image.
+    """
+    height, width = surface.face_ids.shape
+    clip = transform_points(camera.clip_from_world(width / height), mesh.positions)
+    ids = points.beside(surface.face_ids)
+    seen = _interpolated(mesh, clip, ids, points.beside(surface.depth), points.place)
+    # Where a surface ends, the face that is seen near by may not reach to its end.
+    weight = points.weight[:, None]
+    on_edge = []
+    for values in (mesh.positions, mesh.normals):
+        start, end = (jnp.asarray(values).at[v].get(mode="clip") for v in points.vertices)
+        on_edge.append((1 - weight) * start + weight * end)
+    own = (points.ends & jnp.array([[True], [False]]))[..., None]
+    position = jnp.where(own, on_edge[0], seen.position)
+    normal = jnp.where(own, safe_normalize(on_edge[1]), seen.normal)
+    return _turned(camera, seen._replace(position=position, normal=normal))
 
 
 def mesh_creases(mesh: Mesh, edges: MeshEdges) -> Bool[Array, " edges"]:

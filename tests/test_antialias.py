@@ -98,6 +98,10 @@ def test_the_image_is_blended_by_its_coverage(scene):
         scene.mesh, scene.camera, scene.lights, image_size=SIZE, map_size=32, edges=edges
     )
     np.testing.assert_array_equal(image.coverage.share, found.share)
+    # Of the boxes, edges between two sides that are seen count too, as their look changes there.
+    smooth = scene.mesh._replace(normals=np.zeros_like(scene.mesh.normals))
+    outlines = surface_coverage(smooth, scene.camera, surface, edges)
+    assert np.sum(np.asarray(found.share) < 1) > 1.05 * np.sum(np.asarray(outlines.share) < 1)
     assert 0.01 < np.mean(np.asarray(found.share) < 1) < 0.5
     assert (
         render(scene.mesh, scene.camera, scene.lights, image_size=SIZE, map_size=32).coverage

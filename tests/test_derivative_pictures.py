@@ -16,10 +16,10 @@ from experiments.edge_gradients.derivative_pictures import Derivatives, color_li
 from experiments.edge_gradients.scene_parameters import (
     Setup,
     choose_parameters,
-    mesh_parts,
     scene_parameters,
 )
 from experiments.files.images import read_exr
+from experiments.mesh_parts import mesh_parts
 from experiments.scenes.staging import placed, staged, sun
 from experiments.technique_words import parse_bias, parse_lookup
 from shadows import OrthographicCamera, SpotLight, mesh_edges

@@ -28,9 +28,10 @@ from experiments.edge_fits.scene_numbers import (
     rotation,
     vertex_numbers,
 )
-from experiments.edge_fits.shadow_view import ShadowView, Technique, split_caster, vertices_of
+from experiments.edge_fits.shadow_view import ShadowView, Technique
 from experiments.edge_fits.smooth_fit import rows_and_links, share_pulls
 from experiments.edge_gradients.quad_shadow import CAMERAS, CORNERS, LIGHTS, quad_over_floor
+from experiments.mesh_parts import split_caster
 from experiments.scene import Material, Scene
 from experiments.scenes import load_scene
 from shadows import BilinearFilter, ConstantBias, HardCompare, SingleLayout
@@ -169,10 +170,10 @@ def test_standard_errors_are_those_of_many_noisy_fits():
 def test_the_caster_is_all_but_the_ground():
     for name in ("bracket", "thin-box", "sphere"):
         scene = load_scene(name)
-        casts = split_caster(scene.mesh)
+        casts, caster = split_caster(scene.mesh)
         heights = scene.mesh.positions[scene.mesh.faces[~casts], 1]
         np.testing.assert_allclose(heights, 0, atol=1e-6)
-        assert len(vertices_of(scene.mesh, casts)) == len(scene.mesh.positions) - 4
+        assert len(caster) == len(scene.mesh.positions) - 4
 
 
 @pytest.mark.errors
@@ -232,7 +233,7 @@ def quad_problem(covered):
     camera = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), CAMERAS["lit area"])
     faces = np.zeros(len(mesh.faces), np.int32)
     scene = Scene("quad", mesh, faces, (Material(),), camera, (light,))
-    casts = split_caster(mesh)
+    casts, _ = split_caster(mesh)
     view = ShadowView.of(scene, TECHNIQUE, image_size=(128, 128), seen=~casts)
     if not covered:
         view = eqx.tree_at(lambda view: view.edges, view, None)

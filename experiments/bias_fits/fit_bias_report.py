@@ -1,7 +1,6 @@
 """What a bias fit leaves behind: pictures, a curve, summary.json and a table."""
 
 import dataclasses
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +19,8 @@ from ..figures import (
     save_error_curve,
     soft_error_picture,
 )
-from ..files.images import atomic_path, write_exr, write_png
+from ..files.images import write_exr, write_png
+from ..json_file import write_json
 from ..metrics import ShadowErrors, SoftShadowErrors
 from ..options import numbers, technique_name
 from ..provenance import commit, device, versions
@@ -195,8 +195,7 @@ def write_summary(outcome: Outcome, settings: Mapping[str, Any], out: Path) -> d
     made_with = {"versions": versions(), "device": device(), "commit": commit()}
     summary = _summary(outcome)
     content = {"settings": settings, **summary, **made_with}
-    with atomic_path(out / "summary.json") as temporary:
-        temporary.write_text(json.dumps(content, indent=2) + "\n", "utf-8")
+    write_json(out / "summary.json", content)
     return summary
 
 

@@ -8,6 +8,7 @@ import tyro
 
 from ..checks import make_folder
 from ..console import say_notes, stage
+from ..mesh_parts import split_caster
 from ..rendering.render_command import ImageSize, MapSize, SceneName
 from ..technique_words import BiasWords, CompareWords, FilterWords, LayoutWords, ShadingWords
 from .fit_options import (
@@ -26,7 +27,7 @@ from .fit_options import (
 )
 from .run_fit import Fit, run_fit
 from .scene_numbers import SceneProblem, State, numbers_of
-from .shadow_view import ShadowView, split_caster, vertices_of
+from .shadow_view import ShadowView
 
 _USUAL_START = ("turn.y=70",)
 
@@ -56,7 +57,7 @@ def fit(
 ) -> None:
     """Find how a caster is turned and shifted from the shadow that it throws.
 
-    The camera sees the ground alone: the part of the mesh with the largest surface. All else is
+    The camera sees the ground alone: the part of the mesh with the largest box. All else is
     the caster, which moves as one. A pose is a turn about the middle of the caster's box (an
     axis times degrees, world axes) and a shift, both from the scene as it is; each light
     gives an image. Writes comparison.png, progress_curve.png, summary.json; stages.json lets a
@@ -68,8 +69,7 @@ def fit(
     )  # fmt: skip
     with stage(f"loading {scene}"):
         loaded, technique, chosen_bias, pictures = load(options)
-        casts = split_caster(loaded.mesh)
-        caster = vertices_of(loaded.mesh, casts)
+        casts, caster = split_caster(loaded.mesh)
         view = ShadowView.of(loaded, technique, image_size=image_size, seen=~casts)
         zero = np.zeros(3, np.float32)
         states = tuple(State(zero, zero, light, chosen_bias) for light in loaded.lights)

@@ -18,6 +18,7 @@ from ..checks import make_folder
 from ..console import say, say_notes, stage
 from ..files.images import atomic_path
 from ..json_file import check_settings, read_json, write_json
+from ..mesh_parts import split_caster
 from ..panels import Curve
 from ..provenance import commit, device, versions
 from ..rendering.prepare_scene import prepare_scene
@@ -41,7 +42,7 @@ from .fit_options import (
 )
 from .run_fit import Fit, draw_images, draw_progress, run_fit
 from .scene_numbers import SceneProblem, State, vertex_numbers
-from .shadow_view import ShadowView, Technique, split_caster, vertices_of
+from .shadow_view import ShadowView, Technique
 from .smooth_fit import SmoothFit, Surface, rows_and_links, uniform_adam
 
 _STEP = 0.01  # of the caster's size
@@ -96,7 +97,7 @@ def fit(
 ) -> None:
     """Move the vertices of a caster until its shadow is that of the target.
 
-    The camera sees the ground alone: the part of the mesh with the largest surface; all else is
+    The camera sees the ground alone: the part of the mesh with the largest box; all else is
     the caster. Writes the caster (caster.ply), comparison.png, progress_curve.png, summary.json;
     a stopped fit goes on with --resume.
     """
@@ -108,8 +109,7 @@ def fit(
         raise ValueError("--smoothness: expected at least 0, and --steps at least 1")
     with stage(f"loading {scene}"):
         loaded, technique, chosen_bias, pictures = load(options)
-        casts = split_caster(loaded.mesh)
-        caster = vertices_of(loaded.mesh, casts)
+        casts, caster = split_caster(loaded.mesh)
         view = ShadowView.of(loaded, technique, image_size=image_size, seen=~casts)
     say_notes(loaded.notes)
     settings = options.settings | {
@@ -137,7 +137,7 @@ def fit(
         )
         targets = targets.astype(np.float32)
     make_folder(out)
-    _fit_all(loaded, surface, casts, targets, out, settings, (steps, adam), resume=resume)
+    _fit_all(loaded, surface, casts, targets, out, settings, resume=resume)
 
 
 def _fit_all(
@@ -147,11 +147,10 @@ def _fit_all(
     targets: Images,
     out: Path,
     settings: dict[str, Any],
-    counts: tuple[int, int],
     *,
     resume: bool,
 ) -> None:
-    steps, adam = counts
+    steps, adam = settings["steps"], settings["adam"]
     with stage("compiling, and looking at the start"):
         under_way = SmoothFit(surface, jnp.asarray(targets), steps)
         images = jax.jit(Surface.images)
@@ -194,11 +193,11 @@ def _fit_all(
     }  # fmt: skip
     if adam:
         with stage("Adam beside it") as report:
-            descent = uniform_adam(
+            summary["adam"] = uniform_adam(
                 surface, jnp.asarray(targets), steps=adam, rate=_ADAM_RATE, report=report
             )
-        curves["Adam with one second moment, sharp"] = Curve(list(range(1, 1 + adam)), descent.rms)
-        summary["adam"] = descent.rms
+        name = "Adam with one second moment, sharp"
+        curves[name] = Curve(list(range(1, 1 + adam)), summary["adam"])
     _write_caster(out / "caster.ply", loaded, surface, under_way.unknowns, casts)
     made_with = {"versions": versions(), "device": device(), "commit": commit()}
     write_json(out / "summary.json", {"settings": settings, **summary, **made_with})
@@ -266,10 +265,9 @@ def _surface(
 def _shape_images(loaded: Scene, technique: Technique, options: Options, shape: str) -> Images:
     """Return images of the shadow of another caster, brought into the box of this one."""
     other = prepare_scene(load_scene(shape))
-    theirs = split_caster(other.mesh)
-    vertices = vertices_of(other.mesh, theirs)
-    casts = split_caster(loaded.mesh)
-    box = np.asarray(loaded.mesh.positions)[vertices_of(loaded.mesh, casts)]
+    theirs, vertices = split_caster(other.mesh)
+    casts, own = split_caster(loaded.mesh)
+    box = np.asarray(loaded.mesh.positions)[own]
     points = np.asarray(other.mesh.positions)[vertices]
     middle = lambda p: 0.5 * (p.min(axis=0) + p.max(axis=0))
     scale = np.max(box.max(axis=0) - box.min(axis=0)) / np.max(

@@ -118,30 +118,30 @@ def fit_images(
     targets = jnp.asarray(targets)
     pixels = [blur * max(targets.shape[1:]) for blur in blurs]
     half, even = (len(pixels) + 1) // 2, jnp.ones_like(targets)
-    stages, before = list(done), len(done)
+    stages: list[Stage] = []
+    before = iter(done)
 
     def follow(start: int, vector: np.ndarray, blur: float, weights: Images = even) -> np.ndarray:
-        nonlocal before
-        if before > 0:
-            before -= 1
-            return np.array(stages[len(done) - before - 1].vector)
+        stage = next(before, None) or solve(start, vector, blur, weights)
+        stages.append(stage)
+        return np.array(stage.vector)
+
+    def solve(start: int, vector: np.ndarray, blur: float, weights: Images) -> Stage:
         begin = time.perf_counter()
         solution = _solve(jnp.asarray(vector), problem, targets, jnp.asarray(blur), weights)
         rms = float(jnp.sqrt(jnp.mean((solution.aux - targets) ** 2)))
-        stages.append(
-            Stage(
-                start,
-                blur,
-                tuple(map(float, solution.value)),
-                rms,
-                int(solution.stats["num_steps"]),
-                time.perf_counter() - begin,
-                "converged" if solution.result == optx.RESULTS.successful else "all steps taken",
-            )
+        stage = Stage(
+            start,
+            blur,
+            tuple(map(float, solution.value)),
+            rms,
+            int(solution.stats["num_steps"]),
+            time.perf_counter() - begin,
+            "converged" if solution.result == optx.RESULTS.successful else "all steps taken",
         )
-        keep(stages)
+        keep([*stages, stage])
         report(f"start {start + 1} of {len(starts)}, blur {blur:.3g} pixels: rms {rms:.3g}")
-        return np.asarray(solution.value)
+        return stage
 
     ends = []
     for k, vector in enumerate(starts):

@@ -5,8 +5,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from shadows import (
     Appearance,
@@ -25,7 +23,6 @@ from shadows import (
     surface_appearance,
     surface_visibility,
 )
-from tangentspace.mesh import Mesh
 from tangentspace.shading import Shading
 
 from ..scene import Scene
@@ -122,32 +119,6 @@ class ShadowView(eqx.Module):
         return jnp.mean(color, axis=-1)
 
 
-def split_caster(mesh: Mesh) -> Bool[np.ndarray, " faces"]:
-    """Tell which faces cast: all but those of the part with the largest surface, the ground.
-
-    Raises:
-        ValueError: If there is one part alone.
-    """
-    edges = mesh_edges(mesh.positions, mesh.faces)
-    parts = _parts(np.asarray(edges.edge_ids), len(edges.vertices))
-    a, b, c = (np.asarray(mesh.positions, np.float64)[mesh.faces[:, k]] for k in range(3))
-    areas = np.bincount(parts, np.linalg.norm(np.cross(b - a, c - a), axis=1))
-    if (areas > 0).sum() < 2:
-        raise ValueError("mesh: expected a caster over a ground, got one connected part")
-    return parts != areas.argmax()
-
-
-def _parts(edge_ids: Int[np.ndarray, "faces 3"], edge_count: int) -> Int[np.ndarray, " faces"]:
-    """Return for each face a number that faces connected by edges share."""
-    face_count = len(edge_ids)
-    faces = np.repeat(np.arange(face_count), 3)
-    size = face_count + edge_count
-    links = coo_array(
-        (np.ones(faces.size, np.int8), (faces, face_count + edge_ids.ravel())), (size, size)
-    )
-    return connected_components(links, directed=False)[1][:face_count]
-
-
 @eqx.filter_jit
 def _look(arrays: tuple, image_size: tuple[int, int]) -> tuple[Surface, Appearance]:
     mesh, camera, materials, face_materials = arrays
@@ -155,15 +126,3 @@ def _look(arrays: tuple, image_size: tuple[int, int]) -> tuple[Surface, Appearan
     return surface, surface_appearance(
         mesh, camera, surface, materials, face_materials=face_materials
     )
-
-
-def vertices_of(mesh: Mesh, faces: Bool[np.ndarray, " faces"]) -> Int[np.ndarray, " chosen"]:
-    """Return the vertices of chosen faces.
-
-    Raises:
-        ValueError: If the other faces have some of them too.
-    """
-    mine, others = np.unique(mesh.faces[faces]), np.unique(mesh.faces[~faces])
-    if np.isin(mine, others).any():
-        raise ValueError("mesh: the caster shares vertices with the ground; split them")
-    return mine

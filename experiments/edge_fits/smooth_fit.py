@@ -179,18 +179,6 @@ class SmoothFit:
         return int(np.argmin([abs(float(blur) - self.blur) for blur in self._blurs]))
 
 
-class Descent(NamedTuple):
-    """How a plain descent went.
-
-    Attributes:
-        rms: Of the images' difference at each evaluation.
-        unknowns: At the end.
-    """
-
-    rms: list[float]
-    unknowns: Float[np.ndarray, "rows 3"]
-
-
 def uniform_adam(
     surface: Surface,
     targets: Images,
@@ -198,8 +186,11 @@ def uniform_adam(
     steps: int,
     rate: float,
     report: Callable[[str], None] = lambda text: None,
-) -> Descent:
+) -> list[float]:
     """Descend by Adam with one second moment for all numbers, as the reference does.
+
+    Returns:
+        The root mean square of the images' difference at each evaluation.
 
     Args:
         surface: Whose vertices are free.
@@ -220,7 +211,7 @@ def uniform_adam(
         unknowns = unknowns - np.float32(rate / (1 - 0.9**step) / root) * mean
         if step % 10 == 0:
             report(f"{step} of {steps}, rms {rms[-1]:.3g}")
-    return Descent(rms, unknowns)
+    return rms
 
 
 def rows_and_links(

@@ -1,6 +1,5 @@
 """``python -m experiments derivatives``: how an image changes with the numbers of its scene."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,7 +10,9 @@ from shadows.silhouettes import mesh_edges
 
 from ..checks import check_folder, check_reach, check_scene, check_size, make_folder
 from ..console import say, say_notes, say_table, stage
-from ..files.images import atomic_path, write_exr
+from ..files.images import write_exr
+from ..json_file import write_json
+from ..mesh_parts import Part, mesh_parts
 from ..provenance import commit, device, versions
 from ..rendering.prepare_scene import prepare_scene
 from ..rendering.render_command import ImageSize, MapSize, SceneName
@@ -32,10 +33,8 @@ from ..technique_words import (
 from .derivative_pictures import Against, Derivatives, Sizes, derivatives, save_derivatives
 from .scene_parameters import (
     Parameter,
-    Part,
     Setup,
     choose_parameters,
-    mesh_parts,
     scene_parameters,
 )
 
@@ -174,8 +173,7 @@ def _write(
         })  # fmt: skip
     made_with = {"versions": versions(), "device": device(), "commit": commit()}
     content = {"settings": settings, "derivatives": rows, **made_with}
-    with atomic_path(out / "derivatives.json") as temporary:
-        temporary.write_text(json.dumps(content, indent=2) + "\n", "utf-8")
+    write_json(out / "derivatives.json", content)
 
 
 def _figures(derivative: Derivatives, image: Any) -> dict[str, float | None]:

@@ -20,22 +20,20 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse
 from jaxtyping import Array, Bool, Float
 
 from shadows.bias import CombinedBias
 from shadows.compare import Compare
 from shadows.filters import Filter
 from shadows.lights import Light
-from shadows.silhouettes import MeshEdges
 from shadows.transforms import Camera, OrthographicCamera, Scalar
 from tangentspace._math import safe_normalize
 from tangentspace.mesh import Mesh
 
+from ..mesh_parts import Part, used_vertices
 from ..options import numbers
 from ..scene import Scene
 
-_MOST_PARTS = 9
 _STEP = 0.5  # of a pixel; what is farther from its axis than the casters' middle moves more
 _RELATIVE_STEP = 0.01
 _UNITS = {"position": "world length", "direction": "radian", "inner_angle": "radian",
@@ -88,41 +86,6 @@ class Parameter(NamedTuple):
         return jax.jvp(moved, (change,), (jnp.ones_like(change),))[1]
 
 
-class Part(NamedTuple):
-    """Faces that hang together.
-
-    Attributes:
-        vertices: Which of the mesh's.
-        faces: How many.
-        size: Of its box, world lengths.
-    """
-
-    vertices: Bool[np.ndarray, " vertices"]
-    faces: int
-    size: Float[np.ndarray, "3"]
-
-
-def mesh_parts(mesh: Mesh, edges: MeshEdges) -> list[Part]:
-    """Return the nine parts of a mesh with the largest boxes, or all, the largest first."""
-    positions, faces = np.asarray(mesh.positions), np.asarray(mesh.faces)
-    start, end = np.asarray(edges.vertices).T
-    links = scipy.sparse.coo_array((np.ones(len(start)), (start, end)), shape=(len(positions),) * 2)
-    count, part = scipy.sparse.csgraph.connected_components(links, directed=False)
-    part_of_face = part[start[edges.edge_ids[:, 0]]]
-    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
-    for corner in faces.T:
-        np.minimum.at(low, part_of_face, positions[corner])
-        np.maximum.at(high, part_of_face, positions[corner])
-    known, first = np.unique(part_of_face, return_index=True)
-    known = known[np.argsort(first)]
-    size = high[known] - low[known]
-    parts = []
-    for k in np.argsort(-np.linalg.norm(size, axis=1), kind="stable")[:_MOST_PARTS]:
-        mine = part_of_face == known[k]
-        parts.append(Part(_used(mesh, mine), int(mine.sum()), size[k]))
-    return parts
-
-
 def scene_parameters(setup: Setup, parts: Sequence[Part], image_height: int) -> list[Parameter]:
     """Return all numbers of a setup that move its image.
 
@@ -131,7 +94,7 @@ def scene_parameters(setup: Setup, parts: Sequence[Part], image_height: int) -> 
         parts: ``mesh_parts`` of its mesh.
         image_height: Pixels, for the steps of differences.
     """
-    casters = _used(setup.mesh)
+    casters = used_vertices(setup.mesh)
     if len(parts) > 1:
         casters &= ~parts[0].vertices
     middle, arm = _middle_and_arm(setup.mesh, casters)
@@ -271,15 +234,6 @@ def _middle_and_arm(
     positions = np.asarray(mesh.positions)[mine]
     low, high = positions.min(axis=0), positions.max(axis=0)
     return 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low)) or 1.0
-
-
-def _used(
-    mesh: Mesh, faces: Bool[np.ndarray, " faces"] | slice = slice(None)
-) -> Bool[np.ndarray, " vertices"]:
-    """Return which vertices some faces use."""
-    used = np.zeros(len(mesh.positions), bool)
-    used[np.asarray(mesh.faces)[faces]] = True
-    return used
 
 
 def _pixel_length(camera: Camera, middle: Float[np.ndarray, "3"], height: int) -> float:
