@@ -45,7 +45,8 @@ class _Walks(NamedTuple):
 
     Attributes:
         pair: Texel of the way's start, and that it leads down if more than there are texels.
-        end: The edge where each surface ends before the other's centre; -1 if none does.
+        end: The edge where each surface ends before the other's centre; where it leads on to
+            what is seen there, the first crease on the way; -1 if there is neither.
         last: The face of it that lies over the other's centre, -1 if none does.
     """
 
@@ -62,6 +63,7 @@ class _Walker(NamedTuple):
         leg: 0 on the way, 1 on the way back, -1 idle.
         face: Where it is.
         came_by: The edge over which it came there; -1 at the start.
+        crease: The first that it came over on this leg; -1 if none.
         steps: Made on this leg.
         end: Found on leg 0.
         last: Found on leg 0.
@@ -71,6 +73,7 @@ class _Walker(NamedTuple):
     leg: Index
     face: Index
     came_by: Index
+    crease: Index
     steps: Index
     end: Index
     last: Index
@@ -216,20 +219,22 @@ def _follow(
         along, edge, run = _leave(screen, links, ways, jnp.maximum(face, 0), walker.came_by)
         next_face = jnp.where(run > 0, get(links.backward, edge), get(links.forward, edge))
         lost = (face < 0) | (run == 0) | (walker.steps >= _STEPS)
-        ends = (next_face == none) | get(links.creases, edge)
-        passed, ended = ~lost & (along > 1), ~lost & (along <= 1) & ends
+        passed, ended = ~lost & (along > 1), ~lost & (along <= 1) & (next_face == none)
         done = (leg >= 0) & (lost | passed | ended)
-        end = jnp.where(ended, edge, -1)
+        crossed = get(links.creases, edge) & (walker.crease < 0)
+        arrived = passed & (face == far)
+        end = jnp.where(ended, edge, jnp.where(arrived, walker.crease, -1))
         last = jnp.where(passed | ended, face, -1)
 
         both = _Walks(pair, (walker.end, end), (walker.last, last))
         walks, count = _put(walks, both, done & (leg == 1), count)
-        back = done & (leg == 0) & ~(passed & (face == far))
+        back = done & (leg == 0) & ~(arrived & (end < 0))
         walker = _Walker(
             pair,
             jnp.where(back, 1, jnp.where(done, -1, leg)),
             next_face,
             jnp.where(done, -1, edge),
+            jnp.where(done, -1, jnp.where(crossed, edge, walker.crease)),
             jnp.where(done, 0, walker.steps + 1),
             jnp.where(back, end, walker.end),
             jnp.where(back, last, walker.last),
@@ -239,7 +244,7 @@ def _follow(
     going = lambda carry: (carry[0] < total) | jnp.any(carry[1].leg >= 0)
     empty = jnp.zeros(pairs.size + -pairs.size % size, jnp.int32)
     walks = _Walks(empty, (empty, empty), (empty, empty))
-    walker = _Walker(idle, idle, idle, idle, jnp.zeros_like(idle), idle, idle)
+    walker = _Walker(idle, idle, idle, idle, idle, jnp.zeros_like(idle), idle, idle)
     _, _, walks, count = lax.while_loop(going, step, (jnp.int32(0), walker, walks, jnp.int32(0)))
     return walks, count
 

@@ -8,10 +8,10 @@ layers at one texel, its own and its neighbour's, and a share.
 
 To find the edge, the surface seen at a texel is followed towards the other, face by face over
 the edges that they share, to the first edge where it ends (an open border) or turns back (a
-silhouette). So it does not matter how small the faces are. In a view that shows colors it also ends
-at a crease, where its shading normal jumps. Where neither surface ends, but
-each lies behind the other at the other's centre, they pass through each other, and the line
-where they do takes the edge's place.
+silhouette). So it does not matter how small the faces are. Where it leads on to what is seen at
+the other, but over a crease at which its shading normal jumps, the crease is the edge, in a view
+that shows colors. Where neither surface ends, but each lies behind the other at the other's
+centre, they pass through each other, and the line where they do takes the edge's place.
 
 An edge is seen by the pairs along rows and by those along columns; each counts by the squared
 cosine between the pair and the edge's normal, which add to 1. Summed along an edge, shares

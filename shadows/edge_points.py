@@ -23,7 +23,7 @@ from tangentspace._math import safe_divide
 
 from ._crossings import Crossings
 from ._fragments import get
-from ._ways import Screen, Ways, edge_crossing, line_crossing, line_planes, place
+from ._ways import Length, Screen, Ways, edge_crossing, line_crossing, line_planes, place
 from .coverage import Coverage, cut_texel
 from .interpolate import ClipPositions, FaceIds, Faces
 from .silhouettes import MeshEdges
@@ -91,7 +91,7 @@ def edge_changes(
     size = min(4 * (height + width), at_edges.texel.size)
     of_edges, of_lines = (-(-crossings.total // size) for crossings in coverage.crossings)
 
-    def points(piece: Int[Array, ""]) -> EdgePoints:
+    def points(piece: Int[Array, ""]) -> tuple[EdgePoints, Ways, Length]:
         lines = piece >= of_edges
         here, there = _part(at_edges, piece, size), _part(at_lines, piece - of_edges, size)
         choose = lambda name: jnp.where(lines, getattr(there, name), getattr(here, name))
@@ -107,7 +107,7 @@ def edge_changes(
         column = texel % width + 0.5 + jnp.where(side < 2, step, 0)
         row = texel // width + 0.5 + jnp.where(side < 2, 0, step)
         ends = ~lines & ~(False if creases is None else get(creases, edge))
-        return EdgePoints(
+        found = EdgePoints(
             jnp.stack([texel, ways.other]),
             (2 * column / width - 1, 1 - 2 * row / height),
             rest,
@@ -115,11 +115,18 @@ def edge_changes(
             vertices,
             safe_divide(a.across, a.across - b.across),
         )
+        return found, ways, along
 
     def step(carry: tuple) -> tuple:
         piece, changes = carry
-        some = points(piece)
-        values = look(some) - some.beside(image)
+        some, ways, along = points(piece)
+        values = look(some)
+        inwards = Ways(ways.texel, ways.side ^ 1, width), Ways(ways.other, ways.side, width)
+        bends = [
+            _bend(*side, coverage, image)
+            for side in zip(values, inwards, (along, 1 - along), strict=True)
+        ]
+        values += jnp.stack(bends) - some.beside(image)
         change = values[1] - values[0]
         # The rest is the neighbour's: that of the second texel is the first one's.
         own = (some.rest % ids.size == some.texels[0])[:, None]
@@ -129,6 +136,39 @@ def edge_changes(
     going = lambda carry: carry[0] < of_edges + of_lines
     changes = lax.while_loop(going, step, (jnp.int32(0), none))[1]
     return changes.reshape(4, *image.shape)
+
+
+def _bend(
+    at_edge: Float[Array, "points channels"],
+    inwards: Ways,
+    away: Length,
+    coverage: Coverage,
+    image: Float[Array, "height width channels"],
+) -> Float[Array, "points channels"]:
+    """Return how far values at centres beside an edge are above straight lines from there.
+
+    The lines go to a texel's width from the edge. Sums over centres take what changes beside an
+    edge, such as light towards the outline of a ball, to change evenly there; the mean of this
+    is what they miss. 0 where there is an edge or the image's border behind the texel.
+
+    Args:
+        at_edge: Values there.
+        inwards: From the texel whose centre it is, away from the edge.
+        away: The edge, in texels.
+        coverage: Of the image.
+        image: Values at the centres.
+    """
+    texel, side, width = inwards
+    size, behind = coverage.side.size, inwards.other
+    there = (behind >= 0) & (behind < size) & ((side >= 2) | (behind // width == texel // width))
+    behind = jnp.where(there, behind, texel)
+    rests = coverage.rests.reshape(-1)
+    parted = get(rests, side * size + texel) + get(rests, (side ^ 1) * size + behind) > 0
+    values = image.reshape(size, -1)
+    centre, next_centre, away = get(values, texel), get(values, behind), away[:, None]
+    at_one = away * centre + (1 - away) * next_centre
+    bend = centre - (1 - away) * at_edge - away * at_one
+    return jnp.where((there & ~parted)[:, None], bend, 0)
 
 
 def _corners(edges: MeshEdges, faces: Faces) -> tuple[Int[Array, " edges"], Int[Array, " edges"]]:

@@ -337,10 +337,11 @@ def _edge_changes(
                 )
                 for light, drawn, kept in zip(lights, maps, prepared, strict=True)
             ]
-            # Where two surfaces meet, a map tells of both at once; beside the edge it does not.
+            # Where two lit surfaces meet, a map tells of both at once; beside the edge it does
+            # not. But at one that is turned away the shadow on the other begins.
             visibilities = [
-                jnp.where(points.ends, there, near)
-                for there, near in zip(looked_up, visibilities, strict=True)
+                jnp.where(points.ends | (facing_visibility(sides, light)[::-1] == 0), there, near)
+                for light, there, near in zip(lights, looked_up, visibilities, strict=True)
             ]
         color = shade(
             sides,

@@ -192,7 +192,7 @@ def _rendered(
 
 @partial(jax.jit, static_argnames=("size", "map_size", "covered"))
 def _change(
-    motion: Motion, moment: Float[np.ndarray, ""], size: int, map_size: int, covered: bool
+    motion: Motion, moment: Float[Array | np.ndarray, ""], size: int, map_size: int, covered: bool
 ) -> Image:
     image = lambda time: _rendered(motion, time, size, map_size, covered)
     return jax.jvp(image, (moment,), (jnp.ones_like(moment),))[1]
