@@ -159,6 +159,44 @@ def test_singular_values_tell_what_images_tell():
     assert combination(np.array([0.1, -0.9, 0.4]), ("x", "y", "z")) == "0.90 y - 0.40 z"
 
 
+def test_a_fit_that_left_the_view_is_flagged():
+    """Derivatives of rounding alone tell of nothing."""
+    found = determined(np.full((100, 2), 1e-9), 0.1)
+    assert not found.known.any()
+    assert np.isinf(found.standard_errors).all()
+    (line,) = sentences(found, ("turn.x", "shift.y"))
+    assert line.startswith("out of view: where the fit ended, none of its numbers changes")
+
+
+def test_faces_that_are_flipped_or_there_twice_cast_the_same_shadow():
+    """In values and derivatives, and so to every fit; to rounding."""
+    scene = load_scene("bracket")
+    casts, caster = split_caster(scene.mesh)
+    faces, materials = np.asarray(scene.mesh.faces), np.asarray(scene.face_materials)
+    some = np.flatnonzero(casts)[::3]
+    flipped = faces.copy()
+    flipped[some] = flipped[some, ::-1]
+    twice = np.concatenate([faces, faces[some], faces[some, ::-1]])
+
+    def look(faces):
+        of_faces = np.resize(materials, len(faces))
+        changed = scene._replace(mesh=scene.mesh._replace(faces=faces), face_materials=of_faces)
+        seen = np.arange(len(faces)) < len(casts)
+        seen[: len(casts)] = ~casts
+        view = ShadowView.of(changed, TECHNIQUE, image_size=(64, 64), seen=seen)
+        state = State(ZERO, ZERO, scene.lights[0], ConstantBias(0.01))
+        numbers = numbers_of(state, ["turn.y", "shift.x"], size=1.0)
+        positions = np.asarray(scene.mesh.positions)
+        problem = SceneProblem(view, positions, caster, (state,), numbers)
+        return images_and_derivatives(jax.tree.map(jnp.asarray, problem), np.zeros(2))
+
+    (image, slope), *others = (look(f) for f in (faces, flipped, twice))
+    assert np.abs(slope).max() > 0.01
+    for other_image, other_slope in others:
+        np.testing.assert_allclose(other_image, image, atol=1e-5)
+        np.testing.assert_allclose(other_slope, slope, atol=1e-5)
+
+
 def test_standard_errors_are_those_of_many_noisy_fits():
     rng = np.random.default_rng(1)
     jacobian = rng.normal(size=(50, 3)) * [1, 5, 0.3]

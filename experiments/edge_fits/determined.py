@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 _SHARE = 1e-4  # of the largest singular value, below which a combination is not determined
+DARK = 1e-7  # derivatives of pixels below this, in their root mean square, are none
 
 
 class Determined(NamedTuple):
@@ -40,7 +41,7 @@ def determined(jacobian: Float[np.ndarray, "pixels numbers"], noise: float) -> D
         noise: Standard deviation in each pixel.
     """
     _, singular, directions = np.linalg.svd(jacobian, full_matrices=False)
-    known = singular > _SHARE * max(singular[0], np.finfo(float).tiny)
+    known = singular > max(_SHARE * singular[0], DARK * np.sqrt(len(jacobian)))
     spread = noise / np.where(known, singular, 1)
     variance = np.sum((spread[:, None] * directions)[known] ** 2, axis=0)
     blind = (np.abs(directions[~known]) > 0.05).any(axis=0)
@@ -49,6 +50,11 @@ def determined(jacobian: Float[np.ndarray, "pixels numbers"], noise: float) -> D
 
 def sentences(found: Determined, names: tuple[str, ...]) -> list[str]:
     """Return a line for each combination that the images do not tell of, and for the weakest."""
+    if not found.known.any():
+        return [
+            "out of view: where the fit ended, none of its numbers changes the images; what casts "
+            "has left the light's view, or its shadow the picture"
+        ]
     lines = [
         f"undetermined: {combination(row, names)} may change without a trace in the images"
         for row in found.directions[~found.known]

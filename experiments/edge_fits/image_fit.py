@@ -25,10 +25,11 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
+from .determined import DARK
+
 BLURS = (1 / 20, 1 / 40, 1 / 80, 1 / 160, 1 / 320, 0.0)  # standard deviations, of the image's side
 _STEPS = 12  # of each blur
 _ROUNDS = 3  # in which pixels that stand out count less
-_DARK = 1e-7  # root mean square derivatives of pixels below this are none
 
 Report = Callable[[str], None]
 Vector = Float[Array, " numbers"]
@@ -169,7 +170,7 @@ def images_and_derivatives(
 
 def check_edges(problem: Problem, jacobians: Sequence[Float[np.ndarray, "pixels numbers"]]) -> None:
     """Refuse a fit that nothing moves, at no start."""
-    if all(np.sqrt(np.mean(jacobian**2)) <= _DARK for jacobian in jacobians):
+    if all(np.sqrt(np.mean(jacobian**2)) <= DARK for jacobian in jacobians):
         raise ValueError(
             f"fit: the images do not change with {', '.join(problem.names)}; no edge that they "
             "move is in view"

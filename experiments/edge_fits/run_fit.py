@@ -98,6 +98,7 @@ def _summary(fit: Fit, found: ImageFit, known: Determined) -> dict[str, Any]:
     numbers = {
         name: {
             "unit": number.unit,
+            "step": number.step * number.told,
             "start": float(told(fit.starts[found.best])[k]),
             "fit": float(told(found.vector)[k]),
             "true": None if fit.truth is None else float(told(fit.truth)[k]),
