@@ -76,14 +76,14 @@ def agreement(rows, way, change):
     """Return whether changes, their signs, and derivative images are those of the truth."""
     clear = [row for row in rows if row.clear]
     return (
-        np.median([row.off[way] for row in clear]) < 0.06,
+        np.median([row.off[way] for row in clear]) < 0.02,
         all(change(row) * row.change > 0 for row in clear),
-        np.median([row.image_off[way] for row in rows]) < 0.1,
+        np.median([row.image_off[way] for row in rows]) < 0.06,
     )
 
 
 def test_derivatives_are_those_of_the_truth_with_coverage_alone(rows):
-    """Measured: medians of 3.0 % and 5.3 %, without coverage 86 % and 95 %."""
+    """Measured: medians of 0.25 % and 3.9 %, without coverage 86 % and 96 %."""
     assert {row.light_kind for row in rows} == set(LIGHT_KINDS)
     assert sum(row.clear for row in rows) >= 4
     covered, plain = attrgetter("covered"), attrgetter("plain")

@@ -24,6 +24,7 @@ from ..json_file import read_json, write_json
 from ..provenance import commit, device, versions
 
 _DEGREES = 0.01  # left of a pose
+_LEAST = 3e-9  # of the chart
 _COLORS = {"least squares": ("#0072b2", "o"), "Adam": ("#d55e00", None)}
 
 
@@ -114,19 +115,20 @@ def _measure(task: Task) -> dict[str, Any]:
         stages = [s for s in found["stages"] if s["start"] == found["best_start"]]
         evaluations = np.cumsum([s["evaluations"] for s in stages]).tolist()
         rms, adam = [s["rms"] for s in stages], found["adam"]["rms"]
+        curve = [[1, *evaluations], [adam[0], *rms]]  # both begin at the same start
         left = [worst(s["vector"]) for s in stages] if turns else []
         adam_left = [worst(vector) for vector in found["adam"]["vectors"]] if turns else []
     else:
         evaluations = [row["evaluations"] for row in found["history"]]
         rms, adam = [row["rms"] for row in found["history"]], found["adam"]
-        left, adam_left = [], []
+        curve, left, adam_left = [evaluations, rms], [], []
     return {
         "title": task.title,
         "ours": task.ours,
         "evaluations": evaluations[-1],
         "seconds": found["seconds"] if "seconds" in found else found["history"][-1]["seconds"],
         "rms": rms[-1],
-        "curve": [evaluations, rms],
+        "curve": curve,
         "worst_turn": left[-1] if turns else None,
         "until": _until(evaluations, left),
         "adam_rms": adam,
@@ -158,12 +160,13 @@ def save_chart(rows: Mapping[str, Mapping[str, Any]], path: Path) -> None:
             label = row["ours"] if name == "least squares" else name
             place.plot(evaluations, rms, color=color, marker=marker, markersize=4, label=label)
         place.set(xscale="log", yscale="log", xlabel="evaluations of images and derivatives")
+        place.set_ylim(bottom=_LEAST)
         place.set_title(row["title"], fontsize=10)
         place.grid(color="0.92")
         place.spines[["top", "right"]].set_visible(False)
         place.legend(frameon=False, fontsize=8, loc="lower left")
     plots[0].set_ylabel("root mean square of fit less target")
-    figure.suptitle("Fits from shadows come down in a fraction of Adam's evaluations")
+    figure.suptitle("How fits from shadows come down, and Adam beside them")
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format=path.suffix[1:])
 
