@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from tangentspace._math import dot, safe_normalize
+from tangentspace._planes import in_planes
 from tangentspace.material import Material, MippedTexture, look_up_texture
 from tangentspace.mesh import Mesh
 from tangentspace.mips import texel_footprint
@@ -61,6 +62,7 @@ class _Region(NamedTuple):
     inside: Bool[Array, "height width"]
 
 
+@in_planes
 def surface_appearance(
     mesh: Mesh,
     camera: Camera,

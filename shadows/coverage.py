@@ -37,7 +37,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from tangentspace._math import safe_divide
+from tangentspace._math import safe_divide, stack3
 
 from ._crossings import Crossings, Links, find_crossings, link_faces, marked
 from ._fragments import get
@@ -205,26 +205,44 @@ def blend_layers(
     Differentiability:
         In the shares and the values.
     """
-    height, width, *channels = image.shape
-    rests = coverage.rests / jnp.maximum(jnp.sum(coverage.rests, axis=0), 1)
-    rests = rests.reshape(4, height, width, *(1 for _ in channels))
-    padded = jnp.pad(image, [(1, 1), (1, 1)] + [(0, 0)] * len(channels))
-    blended = (1 - (rests[0] + rests[1]) - (rests[2] + rests[3])) * image
-    for rest, (row, column) in zip(rests, ((1, 2), (1, 0), (2, 1), (0, 1)), strict=True):
-        blended += rest * padded[row : row + height, column : column + width]
-    return blended if changes is None else _with_changes(blended, rests, changes)
+    height, width = image.shape[:2]
+    right, left, below, above = coverage.rests
+    whole = jnp.maximum((right + left) + (below + above), 1)
+    rests = tuple(rest / whole for rest in (right, left, below, above))
+
+    def blend(own: Array, change: Array | None) -> Array:
+        padded = jnp.pad(own, 1)
+        blended = (1 - (rests[0] + rests[1]) - (rests[2] + rests[3])) * own
+        for rest, (row, column) in zip(rests, ((1, 2), (1, 0), (2, 1), (0, 1)), strict=True):
+            blended += rest * padded[row : row + height, column : column + width]
+        return blended if change is None else _with_changes(blended, rests, change)
+
+    # One channel at a time: on a CPU several times as fast, backwards above all.
+    if image.ndim == 2:
+        return blend(image, changes)
+    parts = image.reshape(height, width, -1)
+    change = None if changes is None else changes.reshape(4, *parts.shape)
+    channels = [
+        blend(parts[..., k], None if change is None else change[..., k])
+        for k in range(parts.shape[-1])
+    ]
+    stack = stack3 if len(channels) == 3 else lambda *planes: jnp.stack(planes, axis=-1)
+    return stack(*channels).reshape(image.shape)
 
 
 @jax.custom_jvp
-def _with_changes(blended: Array, rests: Array, changes: Array) -> Array:
+def _with_changes(blended: Array, rests: tuple[Array, ...], changes: Array) -> Array:
     """Return a blended image whose derivative in the rests is more by the changes."""
     return blended
 
 
 @_with_changes.defjvp
-def _(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Array, Array]:
+def _(primals: tuple, tangents: tuple) -> tuple[Array, Array]:
     blended, _, changes = primals
-    return blended, tangents[0] + jnp.sum(tangents[1] * changes, axis=0)
+    right, left, below, above = (
+        rest * more for rest, more in zip(tangents[1], changes, strict=True)
+    )
+    return blended, tangents[0] + (right + left) + (below + above)
 
 
 def cut_texel(ways: Ways, along: Length, height: int) -> tuple[Bool[Array, " ways"], Index]:

@@ -15,6 +15,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int, PyTree
 
 from tangentspace._math import dot
+from tangentspace._planes import in_planes
 from tangentspace.environment import CubeMap, reflect_environment, skybox
 from tangentspace.lighting import IncomingLight, shade_lights
 from tangentspace.material import Material
@@ -27,12 +28,14 @@ from .compare import Compare, HardCompare
 from .coverage import Coverage, blend_layers
 from .edge_points import EdgePoints, edge_changes
 from .filters import Filter
+from .interpolate import ClipPositions
 from .layouts import Layout, SingleLayout
 from .lights import Light
 from .plane_bias import AdaptiveBias
+from .rasterize import Raster, rasterize
 from .shadow_map import Receiver, ShadowMap, choose_map, receive, render_shadow_map
 from .silhouettes import MeshEdges
-from .surface import Surface, edge_surface, mesh_creases, render_surface, surface_coverage
+from .surface import Surface, edge_surface, mesh_creases, surface_coverage, surface_of
 from .transforms import Camera, Scalar, transform_points
 from .volumes import volume_visibility
 from .window_filters import BilinearFilter
@@ -79,6 +82,7 @@ def receive_surface(
     return receive(surface.position, surface.face_normal, to_light, matrix, map_index=index)
 
 
+@in_planes
 def surface_visibility(
     surface: Surface,
     light: Light,
@@ -148,6 +152,7 @@ def _term_names(bias: Bias) -> str:
     return " and ".join(type(term).__name__ for term in terms if term.follows_plane)
 
 
+@in_planes
 def shade(
     surface: Surface,
     lights: Sequence[Light],
@@ -270,91 +275,118 @@ def render(
     elif len(shadow_maps) != len(lights):
         expected = f"expected one of `shadow_maps` for each of {len(lights)} lights"
         raise ValueError(f"render: {expected}, got {len(shadow_maps)}")
-    surface = render_surface(mesh, camera, image_size=image_size)
     prepared = [
         filter.for_light(light).prepare(bias.prepare(shadow_map))
         for light, shadow_map in zip(lights, shadow_maps, strict=False)
     ]
-    if not cast_shadows:
-        visibilities = tuple(facing_visibility(surface, light) for light in lights)
-    elif volume_edges is not None:
-        visibilities = tuple(
-            volume_visibility(mesh, camera, surface, light, edges=volume_edges) for light in lights
-        )
-    else:
-        visibilities = tuple(
-            surface_visibility(
-                surface, light, drawn, bias=bias, filter=filter, compare=compare, prepared=kept
-            )
-            for light, drawn, kept in zip(lights, shadow_maps, prepared, strict=True)
-        )
-    appearance = surface_appearance(mesh, camera, surface, materials, face_materials=face_materials)
-    color = shade(
-        surface,
+    height, width = image_size
+    clip = transform_points(camera.clip_from_world(width / height), mesh.positions)
+    raster = rasterize(clip, mesh.faces, image_size=image_size)
+    scene = _Scene(
+        mesh,
+        camera,
         lights,
-        visibilities,
-        appearance=appearance,
-        environment=environment,
-        shading=shading,
+        tuple(shadow_maps),
+        prepared,
+        bias,
+        filter,
+        compare,
+        volume_edges,
+        cast_shadows,
+        materials,
+        face_materials,
+        environment,
+        shading,
     )
-    if environment is not None:
-        height, width = image_size
-        sky = skybox(environment, camera.clip_from_world(width / height), height, width)
-        color = jnp.where(surface.covered[..., None], color, sky)
-    image = Rendering(color, visibilities, surface, appearance, tuple(shadow_maps))
+    image = _pixels(scene, clip, raster)
     if edges is None:
         return image
-    covers = surface_coverage(mesh, camera, surface, edges)
-    still = (mesh, camera, lights, prepared, bias, filter, compare, environment, shading)
-    changes = _edge_changes(*_still((image, covers, edges, *still)))
-    return image._replace(color=blend_layers(covers, color, changes=changes), coverage=covers)
+    covers = surface_coverage(mesh, camera, image.surface, edges)
+    changes = _edge_changes(*_still((scene, clip, image, covers, edges)))
+    color = blend_layers(covers, image.color, changes=changes)
+    return image._replace(color=color, coverage=covers)
+
+
+class _Scene(NamedTuple):
+    """What ``render`` was told, and the maps it drew."""
+
+    mesh: Mesh
+    camera: Camera
+    lights: tuple[Light, ...]
+    shadow_maps: tuple[ShadowMap, ...]
+    prepared: list[PyTree]
+    bias: Bias
+    filter: Filter
+    compare: Compare
+    volume_edges: MeshEdges | None
+    cast_shadows: bool
+    materials: Sequence[Material]
+    face_materials: Int[Array | np.ndarray, " faces"] | None
+    environment: CubeMap | None
+    shading: Shading
+
+    def visibilities(self, surface: Surface) -> tuple[Visibility, ...]:
+        """Return how much of each light arrives at the pixels."""
+        if not self.cast_shadows:
+            return tuple(facing_visibility(surface, light) for light in self.lights)
+        if self.volume_edges is not None:
+            return tuple(
+                volume_visibility(self.mesh, self.camera, surface, light, edges=self.volume_edges)
+                for light in self.lights
+            )
+        how = {"bias": self.bias, "filter": self.filter, "compare": self.compare}
+        return tuple(
+            surface_visibility(surface, light, drawn, **how, prepared=kept)
+            for light, drawn, kept in zip(self.lights, self.shadow_maps, self.prepared, strict=True)
+        )
+
+    def shade(
+        self, surface: Surface, visibilities: Sequence[Visibility], appearance: Appearance
+    ) -> Float[Array, "height width 3"]:
+        """Light the pixels."""
+        look = {"appearance": appearance, "environment": self.environment, "shading": self.shading}
+        return shade(surface, self.lights, visibilities, **look)
+
+
+@in_planes
+def _pixels(scene: _Scene, clip: ClipPositions, raster: Raster) -> Rendering:
+    """Return the image, without coverage."""
+    mesh, camera = scene.mesh, scene.camera
+    surface = surface_of(mesh, camera, clip, raster)
+    visibilities = scene.visibilities(surface)
+    appearance = surface_appearance(
+        mesh, camera, surface, scene.materials, face_materials=scene.face_materials
+    )
+    color = scene.shade(surface, visibilities, appearance)
+    if scene.environment is not None:
+        height, width = raster.face_ids.shape
+        matrix = camera.clip_from_world(width / height)
+        sky = skybox(scene.environment, matrix, height, width)
+        color = jnp.where(surface.covered[..., None], color, sky)
+    return Rendering(color, visibilities, surface, appearance, scene.shadow_maps)
 
 
 def _edge_changes(
-    image: Rendering,
-    coverage: Coverage,
-    edges: MeshEdges,
-    mesh: Mesh,
-    camera: Camera,
-    lights: Sequence[Light],
-    prepared: Sequence[PyTree],
-    bias: Bias,
-    filter: Filter,
-    compare: Compare,
-    environment: CubeMap | None,
-    shading: Shading,
+    scene: _Scene, clip: ClipPositions, image: Rendering, coverage: Coverage, edges: MeshEdges
 ) -> Float[Array, "4 height width 3"]:
     """Return what ``blend_layers`` asks of an image: its colors are looked up again at edges."""
-    surface, maps = image.surface, image.shadow_maps
+    mesh, surface = scene.mesh, image.surface
 
     def look(points: EdgePoints) -> Float[Array, "2 points 3"]:
-        sides = edge_surface(mesh, camera, surface, points)
+        sides = edge_surface(mesh, scene.camera, surface, points)
         visibilities = [points.beside(visible) for visible in image.visibilities]
-        if maps:
-            looked_up = [
-                surface_visibility(
-                    sides, light, drawn, bias=bias, filter=filter, compare=compare, prepared=kept
-                )
-                for light, drawn, kept in zip(lights, maps, prepared, strict=True)
-            ]
+        if scene.shadow_maps:
             # Where two lit surfaces meet, a map tells of both at once; beside the edge it does
             # not. But at one that is turned away the shadow on the other begins.
-            visibilities = [
-                jnp.where(points.ends | (facing_visibility(sides, light)[::-1] == 0), there, near)
-                for light, there, near in zip(lights, looked_up, visibilities, strict=True)
+            begins = [
+                points.ends | (facing_visibility(sides, light)[::-1] == 0) for light in scene.lights
             ]
-        color = shade(
-            sides,
-            lights,
-            visibilities,
-            appearance=edge_appearance(image.appearance, surface, sides, points),
-            environment=environment,
-            shading=shading,
-        )
+            pairs = zip(begins, scene.visibilities(sides), visibilities, strict=True)
+            visibilities = [jnp.where(*either) for either in pairs]
+        appearance = edge_appearance(image.appearance, surface, sides, points)
+        color = scene.shade(sides, visibilities, appearance)
         return jnp.where(sides.covered[..., None], color, points.beside(image.color))
 
-    height, width = surface.face_ids.shape
-    clip = transform_points(camera.clip_from_world(width / height), mesh.positions)
     return edge_changes(
         clip,
         mesh.faces,

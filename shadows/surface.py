@@ -7,13 +7,14 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from tangentspace._math import dot, safe_normalize
+from tangentspace._planes import in_planes
 from tangentspace.mesh import Mesh
 from tangentspace.vertex_normals import face_normals
 
 from .coverage import Coverage, coverage
 from .edge_points import EdgePoints
 from .interpolate import ClipPositions, FaceIds, barycentrics, gather_faces, interpolate
-from .rasterize import rasterize
+from .rasterize import Raster, rasterize
 from .silhouettes import MeshEdges
 from .transforms import Camera, transform_points
 
@@ -59,8 +60,21 @@ def render_surface(mesh: Mesh, camera: Camera, *, image_size: tuple[int, int]) -
         Smooth in positions, normals and the camera inside each face; see ``rasterize``.
     """
     matrix = camera.clip_from_world(image_size[1] / image_size[0])
-    seen = surface_at(mesh, transform_points(matrix, mesh.positions), image_size=image_size)
-    return _turned(camera, seen)
+    clip = transform_points(matrix, mesh.positions)
+    return surface_of(mesh, camera, clip, rasterize(clip, mesh.faces, image_size=image_size))
+
+
+@in_planes
+def surface_of(mesh: Mesh, camera: Camera, clip: ClipPositions, raster: Raster) -> Surface:
+    """Return the surface that the eye sees, of faces that are known.
+
+    Args:
+        mesh: World space.
+        camera: The view.
+        clip: The vertices in the view's clip space.
+        raster: What ``rasterize`` found there.
+    """
+    return _turned(camera, _interpolated(mesh, clip, raster.face_ids, raster.depth))
 
 
 def surface_at(mesh: Mesh, clip: ClipPositions, *, image_size: tuple[int, int]) -> Surface:
