@@ -41,7 +41,7 @@ def in_planes(function: Callable[_Args, _Result]) -> Callable[_Args, _Result]:
 
     @functools.wraps(function)
     def planar(*args: _Args.args, **kwargs: _Args.kwargs) -> _Result:
-        arrays, rest = eqx.partition((args, kwargs), eqx.is_array)
+        arrays, rest = eqx.partition((args, kwargs), _is_array)
         given, tree = jax.tree.flatten(arrays)
         if _tracing.get() or not any(isinstance(array, Tracer) for array in given):
             return function(*args, **kwargs)
@@ -50,7 +50,7 @@ def in_planes(function: Callable[_Args, _Result]) -> Callable[_Args, _Result]:
         def rows(*given: Any) -> list:
             nonlocal result_rest, result_tree
             args, kwargs = eqx.combine(jax.tree.unflatten(tree, given), rest)
-            result, result_rest = eqx.partition(function(*args, **kwargs), eqx.is_array)
+            result, result_rest = eqx.partition(function(*args, **kwargs), _is_array)
             results, result_tree = jax.tree.flatten(result)
             return results
 
@@ -64,6 +64,10 @@ def in_planes(function: Callable[_Args, _Result]) -> Callable[_Args, _Result]:
         return eqx.combine(jax.tree.unflatten(result_tree, results), result_rest)
 
     return planar
+
+
+def _is_array(value: Any) -> bool:
+    return isinstance(value, jax.Array)
 
 
 class _Vectors:

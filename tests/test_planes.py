@@ -25,7 +25,7 @@ FUNCTIONS = {
     "stack3": lambda a, b: stack3(a[..., 0], b[..., 2], a[..., 1]) + b,
     "scaled by a column": lambda a, b: safe_divide(a[..., :1], b[..., 1:2]) * a,
     "scaled by a row": lambda a, b: a * jnp.array([1.0, 2.0, 3.0]) + b[:1, :1],
-    "scaled by a number": lambda a, b: 2 * a - jnp.sum(b),
+    "scaled by a number": lambda a, b: 2 * a - jnp.mean(b),
     "cross product": lambda a, b: jnp.cross(a, b),
     "chosen": lambda a, b: jnp.where(a[..., :1] > 0, a, jnp.where(b > a, b, 1.0)),
     "clipped": lambda a, b: jnp.clip(a, -0.5, 0.5) + jnp.clip(b, a, 1.0),
@@ -129,9 +129,8 @@ def test_what_is_closed_over_is_traced_too():
 
 
 def test_long_chains_are_computed_once(monkeypatch):
-    """Lighting backwards in 64x64 pixels. Measured: 401 products in the program, 1 005 without."""
-    monkeypatch.setattr(jax.config, "jax_enable_x64", True)
-    light = lambda n, l, v: BlinnPhongShading()(*map(safe_normalize, (n + l * v, l + v, v * n)))
+    """Lighting backwards in 64x64 pixels. Measured: 134 products in the program, 476 without."""
+    light = lambda a, b, c: BlinnPhongShading()(*map(safe_normalize, (a + b * c, b + c, c * a)))
     vectors = [jnp.asarray(RANDOM.normal(size=(64, 64, 3))) for _ in range(3)]
 
     def products():
@@ -140,4 +139,4 @@ def test_long_chains_are_computed_once(monkeypatch):
 
     once = products()
     monkeypatch.setattr(sys.modules["tangentspace._fusion"], "_LONG", 10**6)
-    assert once < 0.6 * products()
+    assert once < 0.4 * products()
