@@ -18,6 +18,7 @@ from ._ways import Index, Length, Screen, Ways, edge_crossing, face_plane, place
 from .silhouettes import MeshEdges
 
 _PIECE = 2**11  # ways looked at together
+_PAIRS = 2**15  # of texels that are listed together
 _STEPS = 64  # faces that are followed from a texel to its neighbour
 _EQUAL = 2.0**-16  # window depths so close are the same
 _APART = 2.0**-19  # what surfaces that cross part by between two texels; rounding is a fourth of it
@@ -27,17 +28,24 @@ class Crossings(NamedTuple):
     """What was found between texels: edges, or lines where faces pass through each other.
 
     Attributes:
-        texel: Where the way begins.
-        side: Where it leads, as ``Ways``.
+        way: Where each way begins and where it leads: 4 texel + side, as in ``Ways``.
         by: The edge; or two faces, hidden at the way's start and at its end, that are seen
             (as parts of one surface) at the other.
         total: How many are meant, from the first.
     """
 
-    texel: Index
-    side: Index
+    way: Index
     by: tuple[Index, ...]
     total: Int[Array, ""]
+
+    def ways(self, width: int) -> Ways:
+        """Return the ways, in an image so wide."""
+        return Ways(self.way // 4, self.way % 4, width)
+
+    def part(self, first: Int[Array, ""] | int, size: int) -> "Crossings":
+        """Return some of them, the total counted from the first of these."""
+        cut = lambda values: lax.dynamic_slice_in_dim(values, first, size)
+        return Crossings(*jax.tree.map(cut, self[:2]), self.total - first)
 
 
 class _Walks(NamedTuple):
@@ -121,37 +129,52 @@ def find_crossings(
     width = face_ids.shape[1]
     right = jnp.pad(face_ids[:, 1:] != face_ids[:, :-1], ((0, 0), (0, 1)))
     below = jnp.pad(face_ids[1:] != face_ids[:-1], ((0, 1), (0, 0)))
-    pairs = marked(jnp.concatenate([right.reshape(-1), below.reshape(-1)]))
-    ids = face_ids.reshape(-1)
-    walks, count = _follow(screen, links, *pairs, ids, width)
-    piece = min(_PIECE, walks.pair.size)
-    none = jnp.zeros_like(walks.pair)
+    apart = jnp.concatenate([right.reshape(-1), below.reshape(-1)])
+    ids, ends = face_ids.reshape(-1), prefix_sum(apart.astype(jnp.int32))
+    some = min(_PAIRS, -(-apart.size // _PIECE) * _PIECE)
+    piece = min(_PIECE, some)
 
     def step(carry: tuple) -> tuple:
-        first, *kept = carry
-        part = jax.tree.map(lambda x: lax.dynamic_slice_in_dim(x, first, piece), walks)
-        there = first + jnp.arange(piece, dtype=jnp.int32) < count
-        new = _meet(screen, links, part, ids, width)
-        return first + piece, *(_append(*both, there) for both in zip(kept, new, strict=True))
+        first, *found = carry
+        pairs = _chosen(apart, ends - first, some), jnp.minimum(ends[-1] - first, some)
+        walks, count = _follow(screen, links, *pairs, ids, width)
 
-    start = (Crossings(none, none, (none,) * size, jnp.int32(0)) for size in (1, 2))
-    carry = (jnp.int32(0), *start)
-    _, at_edges, at_lines = lax.while_loop(lambda carry: carry[0] < count, step, carry)
+        def meet(carry: tuple) -> tuple:
+            start, *kept = carry
+            part = jax.tree.map(lambda x: lax.dynamic_slice_in_dim(x, start, piece), walks)
+            there = start + jnp.arange(piece, dtype=jnp.int32) < count
+            new = _meet(screen, links, part, ids, width)
+            return start + piece, *(_append(*both, there) for both in zip(kept, new, strict=True))
+
+        found = lax.while_loop(lambda carry: carry[0] < count, meet, (jnp.int32(0), *found))[1:]
+        return first + some, *found
+
+    none = jnp.zeros(apart.size, jnp.int32)
+    found = (Crossings(none, (none,) * size, jnp.int32(0)) for size in (1, 2))
+    carry = (jnp.int32(0), *found)
+    _, at_edges, at_lines = lax.while_loop(lambda carry: carry[0] < ends[-1], step, carry)
     return at_edges, at_lines
 
 
 def marked(mask: Bool[Array, " items"]) -> tuple[Int[Array, " items"], Int[Array, ""]]:
     """Return the indices of what is true, from the first, and how many they are."""
     ends = prefix_sum(mask.astype(jnp.int32))
-    places = jnp.where(mask, ends - 1, mask.size)
+    return _chosen(mask, ends, mask.size), ends[-1]
+
+
+def _chosen(
+    mask: Bool[Array, " items"], ends: Int[Array, " items"], size: int
+) -> Int[Array, " chosen"]:
+    """Return the indices of what is true, those to which ``ends`` counts from 1 to a size."""
+    places = jnp.where(mask & (ends > 0), ends - 1, size)
     items = jnp.arange(mask.size, dtype=jnp.int32)
-    return jnp.zeros_like(items).at[places].set(items, mode="drop"), ends[-1]
+    return jnp.zeros(size, jnp.int32).at[places].set(items, mode="drop")
 
 
 def _append(kept: Crossings, new: Crossings, there: Bool[Array, " ways"]) -> Crossings:
     """Append those that were found, ``new.total`` being whether each was."""
-    (texel, side, by), total = _put(kept[:3], new[:3], new.total & there, kept.total)
-    return Crossings(texel, side, by, total)
+    (way, by), total = _put(kept[:2], new[:2], new.total & there, kept.total)
+    return Crossings(way, by, total)
 
 
 def _put(
@@ -294,14 +317,15 @@ def _meet(
     there, back_there = jnp.split(seen, 2)
     nearer = back_there & (~there | (jnp.less(*jnp.split(depth, 2)[::-1])))
     found = [jnp.where(nearer, *jnp.split(x, 2)[::-1]) for x in (texel, side, edge)]
-    at_edges = Crossings(found[0], found[1], (found[2],), there | back_there)
+    at_edges = Crossings(4 * found[0] + found[1], (found[2],), there | back_there)
     # Neither is seen to end before the other's centre, and they are not one surface.
     last, back_last = walks.last
     apart = (last >= 0) & (back_last >= 0) & (last != other) & (back_last != face)
     here = face_plane(screen, ways, back_last).at(0.0) - face_plane(screen, ways, face).at(0.0)
     beyond = face_plane(screen, back, last).at(0.0) - face_plane(screen, back, other).at(0.0)
     cross = apart & (here >= 0) & (beyond >= 0) & (here + beyond > _APART)
-    return at_edges, Crossings(ways.texel, ways.side, (back_last, last), cross & ~at_edges.total)
+    way = 4 * ways.texel + ways.side
+    return at_edges, Crossings(way, (back_last, last), cross & ~at_edges.total)
 
 
 def _edge_depth(screen: Screen, links: Links, ways: Ways, edge: Index) -> tuple[Length, Length]:

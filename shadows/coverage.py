@@ -274,9 +274,9 @@ def _rests(
     texels = height * width
 
     def run(size: int) -> Float[Array, " rests"]:
-        texel, side, by = jax.tree.map(lambda values: values[:size], crossings[:3])
-        ways = Ways(texel, side, width)
-        along, weight, shown = measure(Crossings(texel, side, by, crossings.total), ways)
+        some = crossings.part(0, size)
+        ways = some.ways(width)
+        along, weight, shown = measure(some, ways)
         along = jnp.clip(along, 0, 1)
         own, cut = cut_texel(ways, lax.stop_gradient(along), height)
         part = jnp.where(own, 0.5 - along, along - 0.5)
@@ -284,7 +284,7 @@ def _rests(
         cut = jnp.where(jnp.arange(size) < crossings.total, cut, 4 * texels)
         return jnp.zeros(4 * texels, rest.dtype).at[cut].set(rest, mode="drop")
 
-    rests = _few_or_all(run, crossings.total, few, crossings.texel.size)
+    rests = _few_or_all(run, crossings.total, few, crossings.way.size)
     return rests.reshape(4, height, width)
 
 

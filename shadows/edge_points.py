@@ -14,14 +14,12 @@ References:
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from tangentspace._math import safe_divide
 
-from ._crossings import Crossings
 from ._fragments import get
 from ._ways import Length, Screen, Ways, edge_crossing, line_crossing, line_planes, place
 from .coverage import Coverage, cut_texel
@@ -87,16 +85,17 @@ def edge_changes(
     height, width = face_ids.shape
     screen = Screen.of(clip_positions, faces, height, width)
     ids, (at_edges, at_lines) = face_ids.reshape(-1), coverage.crossings
-    ends_of_edges = _corners(edges, faces)
-    size = min(4 * (height + width), at_edges.texel.size)
+    ends_of_edges, most = _corners(edges, faces), at_edges.way.size
+    size = min(4 * (height + width), most)
     of_edges, of_lines = (-(-crossings.total // size) for crossings in coverage.crossings)
 
     def points(piece: Int[Array, ""]) -> tuple[EdgePoints, Ways, Length]:
         lines = piece >= of_edges
-        here, there = _part(at_edges, piece, size), _part(at_lines, piece - of_edges, size)
-        choose = lambda name: jnp.where(lines, getattr(there, name), getattr(here, name))
-        texel, side, count = (choose(name) for name in ("texel", "side", "total"))
-        ways = Ways(texel, side, width)
+        here = at_edges.part(jnp.clip(piece * size, 0, most - size), size)
+        there = at_lines.part(jnp.clip((piece - of_edges) * size, 0, most - size), size)
+        count = jnp.where(lines, there.total, here.total)
+        ways = here._replace(way=jnp.where(lines, there.way, here.way)).ways(width)
+        texel, side = ways.texel, ways.side
         edge = jnp.where(lines, 0, here.by[0])
         vertices = get(ends_of_edges[0], edge), get(ends_of_edges[1], edge)
         a, b = (place(screen, ways, vertex) for vertex in vertices)
@@ -182,11 +181,3 @@ def _corners(edges: MeshEdges, faces: Faces) -> tuple[Int[Array, " edges"], Int[
     at_ends = jnp.where(forward, start, end), jnp.where(forward, end, start)
     first, second = (none.at[jnp.asarray(edges.edge_ids)].max(values) for values in at_ends)
     return first, second
-
-
-def _part(crossings: Crossings, piece: Int[Array, ""], size: int) -> Crossings:
-    """Return some crossings, their total counted from the first of them."""
-    first = jnp.clip(piece * size, 0, crossings.texel.size - size)
-    cut = lambda values: lax.dynamic_slice_in_dim(values, first, size)
-    texel, side, by = jax.tree.map(cut, crossings[:3])
-    return Crossings(texel, side, by, crossings.total - first)
