@@ -42,12 +42,14 @@ def _run(arguments: Sequence[str]) -> int:
     from .edge_fits.fit_vertices_command import fit as fit_vertices
     from .edge_gradients.derivatives_command import derive
     from .frontier.command import frontier
+    from .memory import keep_freed_memory
     from .normal_map_fits.fit_normal_map_command import fit as fit_normal_map
     from .rendering.render_command import render
     from .simplest.command import simplest
     from .simplest.find import OutOfReach
     from .stability.command import stability
 
+    keep_freed_memory()
     commands = {
         "render": render,
         "fit-bias": fit_bias,

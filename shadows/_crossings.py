@@ -20,6 +20,7 @@ from .silhouettes import MeshEdges
 _PIECE = 2**11  # ways looked at together
 _PAIRS = 2**15  # of texels that are listed together
 _STEPS = 64  # faces that are followed from a texel to its neighbour
+_ROUNDING = 2.0**-10  # of a texel: no edge is so near to a centre
 _EQUAL = 2.0**-16  # window depths so close are the same
 _APART = 2.0**-19  # what surfaces that cross part by between two texels; rounding is a fourth of it
 
@@ -136,8 +137,11 @@ def find_crossings(
 
     def step(carry: tuple) -> tuple:
         first, *found = carry
-        pairs = _chosen(apart, ends - first, some), jnp.minimum(ends[-1] - first, some)
-        walks, count = _follow(screen, links, *pairs, ids, width)
+        pairs = _chosen(apart, ends - first, some)
+        there = first + jnp.arange(some, dtype=jnp.int32) < ends[-1]
+        plain = _is_plain(screen, links, _ways(pairs, width, ids.size), ids)
+        others, count = marked(there & ~plain)
+        walks, count = _follow(screen, links, get(pairs, others), count, ids, width)
 
         def meet(carry: tuple) -> tuple:
             start, *kept = carry
@@ -270,6 +274,28 @@ def _follow(
     walker = _Walker(idle, idle, idle, idle, idle, jnp.zeros_like(idle), idle, idle)
     _, _, walks, count = lax.while_loop(going, step, (jnp.int32(0), walker, walks, jnp.int32(0)))
     return walks, count
+
+
+def _is_plain(
+    screen: Screen, links: Links, ways: Ways, ids: Int[Array, " texels"]
+) -> Bool[Array, " ways"]:
+    """Tell where a way leads over an edge inside the surface, from one of its faces to the other.
+
+    Nothing else can be crossed there, and most ways are such.
+    """
+    here, there = (jnp.maximum(get(ids, texel), 0) for texel in (ways.texel, ways.other))
+    edges, run = [get(column, there) for column in links.edge_ids], jnp.zeros_like(here)
+    edge = jnp.zeros_like(here)
+    for ids_of_edges, runs in zip(links.edge_ids, links.runs, strict=True):
+        this = get(ids_of_edges, here)
+        shared = (this == edges[0]) | (this == edges[1]) | (this == edges[2])
+        edge, run = jnp.where(shared, this, edge), jnp.where(shared, get(runs, here), run)
+    beyond = jnp.where(run > 0, get(links.backward, edge), get(links.forward, edge))
+    inside = (run != 0) & (beyond == there) & ~get(links.creases, edge)
+    a, b = (place(screen, ways, get(end, edge)) for end in links.vertices)
+    in_front = (a.w > 0) & (b.w > 0) & ((a.across >= 0) != (b.across >= 0))
+    along, seen = edge_crossing(a, b), (get(ids, ways.texel) >= 0) & (get(ids, ways.other) >= 0)
+    return seen & inside & in_front & (along > _ROUNDING) & (along < 1 - _ROUNDING)
 
 
 def _ways(pair: Index, width: int, texels: int) -> Ways:
