@@ -46,7 +46,8 @@ class Crossings(NamedTuple):
     def part(self, first: Int[Array, ""] | int, size: int) -> "Crossings":
         """Return some of them, the total counted from the first of these."""
         cut = lambda values: lax.dynamic_slice_in_dim(values, first, size)
-        return Crossings(*jax.tree.map(cut, self[:2]), self.total - first)
+        way, by = jax.tree.map(cut, self[:2])
+        return Crossings(way, by, self.total - first)
 
 
 class _Walks(NamedTuple):

@@ -46,7 +46,9 @@ def compute_once(traced: ClosedJaxpr, given: Sequence) -> Sequence:
         results = eqn.primitive.bind(*map(read, eqn.invars), **params)
         results = results if eqn.primitive.multiple_results else [results]
         for variable, result in zip(eqn.outvars, results, strict=True):
-            values[variable] = result / one.astype(result.dtype) if variable in ends else result
+            values[variable] = (
+                result / jnp.asarray(one, result.dtype) if variable in ends else result
+            )
     return [read(atom) for atom in jaxpr.outvars]
 
 
@@ -102,5 +104,5 @@ def _repeats(eqn: JaxprEqn) -> int:
     """Return how often an operation asks for each number of its operand."""
     if eqn.primitive.name != "broadcast_in_dim":
         return 1
-    sizes = (math.prod(v.aval.shape) for v in (eqn.outvars[0], eqn.invars[0]))
-    return next(sizes) // max(next(sizes), 1)
+    size = lambda atom: math.prod(atom.aval.shape)
+    return size(eqn.outvars[0]) // max(size(eqn.invars[0]), 1)

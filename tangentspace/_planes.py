@@ -45,12 +45,13 @@ def in_planes(function: Callable[_Args, _Result]) -> Callable[_Args, _Result]:
         given, tree = jax.tree.flatten(arrays)
         if _tracing.get() or not any(isinstance(array, Tracer) for array in given):
             return function(*args, **kwargs)
+        call: Callable[..., Any] = function
         result_rest = result_tree = None
 
         def rows(*given: Any) -> list:
             nonlocal result_rest, result_tree
             args, kwargs = eqx.combine(jax.tree.unflatten(tree, given), rest)
-            result, result_rest = eqx.partition(function(*args, **kwargs), _is_array)
+            result, result_rest = eqx.partition(call(*args, **kwargs), _is_array)
             results, result_tree = jax.tree.flatten(result)
             return results
 
@@ -154,7 +155,8 @@ def _evaluate(traced: ClosedJaxpr, given: Sequence) -> list:
 
 def _apply(eqn: JaxprEqn, inputs: list) -> Sequence:
     """Return the results of one operation."""
-    name, shape = eqn.primitive.name, eqn.outvars[0].aval.shape
+    result: Any = eqn.outvars[0]
+    name, shape = eqn.primitive.name, result.aval.shape
     if name in ("jit", "pjit", "closed_call"):
         return _evaluate(eqn.params["jaxpr"], inputs)
     if any(isinstance(value, _Vectors) for value in inputs) or _is_short(shape):

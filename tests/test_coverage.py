@@ -313,9 +313,39 @@ def test_more_crossings_than_there_usually_are_change_nothing(monkeypatch):
     monkeypatch.setattr(
         module, "_few_or_all", lambda run, n, few, most: few_or_all(run, n, 1, most)
     )
+    # And when fewer pairs of texels are listed together than there are.
+    monkeypatch.setattr(sys.modules["shadows._crossings"], "_PAIRS", 64)
+    monkeypatch.setattr(sys.modules["shadows._crossings"], "_PIECE", 32)
     crowded = jax.jit(jax.value_and_grad(lambda clip: total(clip)))(clip)
     np.testing.assert_allclose(crowded[0], usual[0], rtol=1e-12)
     np.testing.assert_allclose(crowded[1], usual[1], rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_edges_inside_a_surface_are_passed_as_by_walking(monkeypatch, seed):
+    """The same shares where each way is followed from face to face, as where plain ones are not."""
+    mesh = scattered(seed)
+    clip, edges = view_of(mesh), edges_of(mesh)
+    ids = rasterize(clip, mesh.faces, image_size=(64, 64)).face_ids
+    module = sys.modules["shadows._crossings"]
+    is_plain, skipped = module._is_plain, []
+
+    def shares_of():
+        return coverage(clip, mesh.faces, edges, ids).rests
+
+    def counted(*arguments):
+        plain = is_plain(*arguments)
+        jax.debug.callback(lambda count: skipped.append(int(count)), jnp.sum(plain))
+        return plain
+
+    monkeypatch.setattr(module, "_is_plain", counted)
+    usual = jax.jit(lambda: shares_of())()
+    monkeypatch.setattr(
+        module, "_is_plain", lambda *arguments: jnp.zeros_like(is_plain(*arguments))
+    )
+    np.testing.assert_array_equal(usual, jax.jit(lambda: shares_of())())
+    jax.effects_barrier()
+    assert sum(skipped) > 100
 
 
 def test_one_texel_has_no_neighbours():

@@ -1,0 +1,36 @@
+"""Freed memory is kept: no page is cleared again for the next call."""
+
+import json
+import platform
+import subprocess
+import sys
+
+import pytest
+
+PROGRAM = """
+import json, resource, sys
+import jax, jax.numpy as jnp
+from experiments.memory import keep_freed_memory
+
+step = jax.jit(lambda x: jnp.cumsum(jnp.cumsum(x, axis=0) * 2, axis=1).sum())
+image = jnp.ones((2048, 2048))
+
+def faults():
+    step(image).block_until_ready()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(5):
+        step(image).block_until_ready()
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+fresh = faults()
+print(json.dumps([keep_freed_memory(), fresh, faults()]))
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="of glibc")
+def test_freed_memory_is_used_again():
+    """Measured: 50 534 pages asked for in five calls, then 8 467."""
+    run = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, check=True)
+    kept, fresh, again = json.loads(run.stdout)
+    assert kept
+    assert again < 0.5 * fresh
