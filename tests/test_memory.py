@@ -23,14 +23,14 @@ def faults():
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 
 fresh = faults()
-print(json.dumps([keep_freed_memory(), fresh, faults()]))
+print(json.dumps([keep_freed_memory(), fresh, min(faults() for _ in range(6))]))
 """
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="of glibc")
 def test_freed_memory_is_used_again():
-    """Measured: 50 534 pages asked for in five calls, then 8 467."""
+    """Measured: 50 534 pages asked for in five calls, then at most 13 after some more calls."""
     run = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, check=True)
     kept, fresh, again = json.loads(run.stdout)
     assert kept
-    assert again < 0.5 * fresh
+    assert again < 0.2 * fresh
