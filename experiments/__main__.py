@@ -12,6 +12,7 @@ from rich.text import Text
 from .console import say_error
 
 _PROGRAM = "python -m experiments"
+_WITH_GRADIENTS = "fit-bias", "fit-normal-map", "fit-light", "fit-pose", "fit-vertices", "derivatives"
 _WITH_WORDS = ("--bias", "--filter", "--compare", "--shading", "--layout")
 
 
@@ -49,7 +50,8 @@ def _run(arguments: Sequence[str]) -> int:
     from .simplest.find import OutOfReach
     from .stability.command import stability
 
-    keep_freed_memory()
+    if arguments and arguments[0] in _WITH_GRADIENTS:
+        keep_freed_memory()
     commands = {
         "render": render,
         "fit-bias": fit_bias,

@@ -38,6 +38,14 @@ def _compiled_functions_end_with_their_module():
     jax.clear_caches()
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _memory_goes_back_to_the_system():
+    """Commands keep what they free, to be sooner; a process of many commands would grow."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("experiments.memory.keep_freed_memory", lambda: False)
+        yield
+
+
 @pytest.fixture(params=[np.float32, np.float64], ids=["float32", "float64"])
 def dtype(request):
     """Run the test in single precision, where users live, and in double."""

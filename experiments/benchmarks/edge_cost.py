@@ -2,7 +2,7 @@
 
 A mesh over a floor, 512x512 pixels, antialiased with its shadow; the value and derivatives of the
 mean square against another image, in all vertices. First with memory from the system for each
-call, as any program has it, then with memory that is kept, as the commands have it. Run it on an
+call, as any program has it, then with memory that is kept, as the fits have it. Run it on an
 idle machine.
 """
 
