@@ -12,7 +12,14 @@ from rich.text import Text
 from .console import say_error
 
 _PROGRAM = "python -m experiments"
-_WITH_GRADIENTS = "fit-bias", "fit-normal-map", "fit-light", "fit-pose", "fit-vertices", "derivatives"
+_WITH_GRADIENTS = (
+    "fit-bias",
+    "fit-normal-map",
+    "fit-light",
+    "fit-pose",
+    "fit-vertices",
+    "derivatives",
+)
 _WITH_WORDS = ("--bias", "--filter", "--compare", "--shading", "--layout")
 
 
