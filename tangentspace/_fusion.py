@@ -3,17 +3,16 @@
 It computes again, for each of its users, what it thinks is cheap: sums, products and choices. A
 long chain of them with many users at its end, and a derivative is such a chain for each of a
 function's values, may be computed dozens of times. What ends in a division is computed once; so
-where a chain has grown long, its end is divided by a one that XLA does not know to be one.
+where a chain has grown long, its end is divided by a one that XLA does not know to be one, as it
+comes from behind a barrier. (The barrier by itself is gone before anything is fused.)
 """
 
 import math
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any
 
 import jax.numpy as jnp
 from jax import lax
-from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var
 
 _LONG = 8  # operations that are not worth to be done twice
@@ -36,11 +35,11 @@ def compute_once(traced: ClosedJaxpr, given: Sequence) -> Sequence:
 
     Derivatives of the result are, too: what is divided forward is divided backward.
     """
-    jaxpr, one = traced.jaxpr, _unknown_one(given)
+    jaxpr, one = traced.jaxpr, lax.optimization_barrier(jnp.ones(()))
     values: dict = dict(zip(jaxpr.constvars, traced.consts, strict=True))
     values.update(zip(jaxpr.invars, given, strict=True))
     read = lambda atom: atom.val if isinstance(atom, Literal) else values[atom]
-    ends = set() if one is None else _ends_of_chains(jaxpr.eqns, jaxpr.outvars)
+    ends = _ends_of_chains(jaxpr.eqns, jaxpr.outvars)
     for eqn in jaxpr.eqns:
         params = eqn.primitive.get_bind_params(eqn.params)
         results = eqn.primitive.bind(*map(read, eqn.invars), **params)
@@ -50,15 +49,6 @@ def compute_once(traced: ClosedJaxpr, given: Sequence) -> Sequence:
                 result / jnp.asarray(one, result.dtype) if variable in ends else result
             )
     return [read(atom) for atom in jaxpr.outvars]
-
-
-def _unknown_one(given: Sequence) -> Any:
-    """Return 1 so that it depends on what is traced; None where no array of numbers is."""
-    for array in given:
-        if isinstance(array, Tracer) and array.size and jnp.issubdtype(array.dtype, jnp.floating):
-            number = lax.stop_gradient(array[(0,) * array.ndim])
-            return jnp.where((number > 0) & (number < 0), 2.0, 1.0)
-    return None
 
 
 def _ends_of_chains(eqns: Sequence[JaxprEqn], results: Sequence) -> set[Var]:
