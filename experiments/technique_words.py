@@ -10,7 +10,7 @@ from shadows.bias import Bias, CombinedBias
 from shadows.compare import Compare
 from shadows.filters import Filter
 from shadows.layouts import CubeLayout, Layout, SingleLayout
-from shadows.render import check_techniques, default_bias
+from shadows.visibility import check_techniques, default_bias
 from tangentspace.shading import Shading
 
 from .checks import stands_inside

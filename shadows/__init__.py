@@ -65,12 +65,8 @@ from .rasterize import Raster as Raster
 from .rasterize import rasterize as rasterize
 from .rasterize import rasterize_two as rasterize_two
 from .render import Rendering as Rendering
-from .render import check_techniques as check_techniques
-from .render import default_bias as default_bias
-from .render import receive_surface as receive_surface
 from .render import render as render
 from .render import shade as shade
-from .render import surface_visibility as surface_visibility
 from .shadow_map import NeighborLayer as NeighborLayer
 from .shadow_map import PlaneSlope as PlaneSlope
 from .shadow_map import Receiver as Receiver
@@ -99,6 +95,10 @@ from .transforms import texel_from_clip as texel_from_clip
 from .transforms import transform_points as transform_points
 from .variance_filter import VSMFilter as VSMFilter
 from .variance_filter import chebyshev_bound as chebyshev_bound
+from .visibility import check_techniques as check_techniques
+from .visibility import default_bias as default_bias
+from .visibility import receive_surface as receive_surface
+from .visibility import surface_visibility as surface_visibility
 from .volumes import blocker_counts as blocker_counts
 from .volumes import volume_visibility as volume_visibility
 from .window_filters import BilinearFilter as BilinearFilter

@@ -134,7 +134,6 @@ def find_crossings(
     apart = jnp.concatenate([right.reshape(-1), below.reshape(-1)])
     ids, ends = face_ids.reshape(-1), prefix_sum(apart.astype(jnp.int32))
     some = min(_PAIRS, -(-apart.size // _PIECE) * _PIECE)
-    piece = min(_PIECE, some)
 
     def step(carry: tuple) -> tuple:
         first, *found = carry
@@ -146,10 +145,10 @@ def find_crossings(
 
         def meet(carry: tuple) -> tuple:
             start, *kept = carry
-            part = jax.tree.map(lambda x: lax.dynamic_slice_in_dim(x, start, piece), walks)
-            there = start + jnp.arange(piece, dtype=jnp.int32) < count
+            part = jax.tree.map(lambda x: lax.dynamic_slice_in_dim(x, start, _PIECE), walks)
+            there = start + jnp.arange(_PIECE, dtype=jnp.int32) < count
             new = _meet(screen, links, part, ids, width)
-            return start + piece, *(_append(*both, there) for both in zip(kept, new, strict=True))
+            return start + _PIECE, *(_append(*both, there) for both in zip(kept, new, strict=True))
 
         found = lax.while_loop(lambda carry: carry[0] < count, meet, (jnp.int32(0), *found))[1:]
         return first + some, *found
@@ -228,8 +227,7 @@ def _follow(
     Returns:
         Walks, but of those ways where one surface leads from end to end, and how many.
     """
-    size, none = min(_PIECE, pairs.size), screen.corners[0].size
-    idle = jnp.full(size, -1, jnp.int32)
+    none, idle = screen.corners[0].size, jnp.full(_PIECE, -1, jnp.int32)
 
     def step(carry: tuple) -> tuple:
         taken, walker, walks, count = carry
@@ -270,7 +268,7 @@ def _follow(
         return jnp.minimum(taken + jnp.sum(free, dtype=jnp.int32), total), walker, walks, count
 
     going = lambda carry: (carry[0] < total) | jnp.any(carry[1].leg >= 0)
-    empty = jnp.zeros(pairs.size + -pairs.size % size, jnp.int32)
+    empty = jnp.zeros_like(pairs)
     walks = _Walks(empty, (empty, empty), (empty, empty))
     walker = _Walker(idle, idle, idle, idle, idle, jnp.zeros_like(idle), idle, idle)
     _, _, walks, count = lax.while_loop(going, step, (jnp.int32(0), walker, walks, jnp.int32(0)))
@@ -284,18 +282,18 @@ def _is_plain(
 
     Nothing else can be crossed there, and most ways are such.
     """
-    here, there = (jnp.maximum(get(ids, texel), 0) for texel in (ways.texel, ways.other))
-    edges, run = [get(column, there) for column in links.edge_ids], jnp.zeros_like(here)
-    edge = jnp.zeros_like(here)
-    for ids_of_edges, runs in zip(links.edge_ids, links.runs, strict=True):
-        this = get(ids_of_edges, here)
+    faces = get(ids, ways.texel), get(ids, ways.other)
+    here, there = (jnp.maximum(face, 0) for face in faces)
+    edges, edge = [get(column, there) for column in links.edge_ids], jnp.full_like(here, -1)
+    for column in links.edge_ids:
+        this = get(column, here)
         shared = (this == edges[0]) | (this == edges[1]) | (this == edges[2])
-        edge, run = jnp.where(shared, this, edge), jnp.where(shared, get(runs, here), run)
-    beyond = jnp.where(run > 0, get(links.backward, edge), get(links.forward, edge))
-    inside = (run != 0) & (beyond == there) & ~get(links.creases, edge)
+        edge = jnp.where(shared, this, edge)
+    meet, edge = edge >= 0, jnp.maximum(edge, 0)
+    inside = meet & ~get(links.creases, edge)
     a, b = (place(screen, ways, get(end, edge)) for end in links.vertices)
     in_front = (a.w > 0) & (b.w > 0) & ((a.across >= 0) != (b.across >= 0))
-    along, seen = edge_crossing(a, b), (get(ids, ways.texel) >= 0) & (get(ids, ways.other) >= 0)
+    along, seen = edge_crossing(a, b), jnp.minimum(*faces) >= 0
     return seen & inside & in_front & (along > _ROUNDING) & (along < 1 - _ROUNDING)
 
 

@@ -37,7 +37,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from tangentspace._math import safe_divide, stack3
+from tangentspace._math import safe_divide, stack_last
 
 from ._crossings import Crossings, Links, find_crossings, link_faces, marked
 from ._fragments import get
@@ -226,8 +226,7 @@ def blend_layers(
         blend(parts[..., k], None if change is None else change[..., k])
         for k in range(parts.shape[-1])
     ]
-    stack = stack3 if len(channels) == 3 else lambda *planes: jnp.stack(planes, axis=-1)
-    return stack(*channels).reshape(image.shape)
+    return stack_last(*channels).reshape(image.shape)
 
 
 @jax.custom_jvp

@@ -18,7 +18,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, Num
 
-from tangentspace._math import safe_divide, stack3
+from tangentspace._math import safe_divide, stack_last
 
 ClipPositions = Float[Array | np.ndarray, "vertices 4"]
 Faces = Int[Array | np.ndarray, "faces 3"]
@@ -65,7 +65,7 @@ def barycentrics(
     areas = [area + lax.stop_gradient(jnp.maximum(-area, 0)) for area in areas]
     total = jnp.where(flat, 0, areas[0] + areas[1] + areas[2])
     weights = [jnp.where(flat, 1 / 3, safe_divide(area, total)) for area in areas]
-    return jnp.where(face_ids[..., None] >= 0, stack3(*weights), 0.0)
+    return jnp.where(face_ids[..., None] >= 0, stack_last(*weights), 0.0)
 
 
 def barycentric_slopes(
@@ -94,7 +94,7 @@ def barycentric_slopes(
             step * safe_divide(slope[k] - safe_divide(areas[k], total) * sum_of_slopes, total)
             for k in range(3)
         ]
-        changes.append(jnp.where(face_ids[..., None] >= 0, stack3(*change), 0.0))
+        changes.append(jnp.where(face_ids[..., None] >= 0, stack_last(*change), 0.0))
     return changes[0], changes[1]
 
 

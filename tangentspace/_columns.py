@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ._math import stack3
+from ._math import stack_last
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Columns:
 
     def rows(self) -> Float[Array, "n 3"]:
         """Return one row per vector."""
-        return stack3(self.x, self.y, self.z)
+        return stack_last(self.x, self.y, self.z)
 
 
 def columns_of(rows: Float[Array, "n 3"]) -> Columns:

@@ -53,7 +53,7 @@ def compute_once(traced: ClosedJaxpr, given: Sequence) -> Sequence:
 
 def _ends_of_chains(eqns: Sequence[JaxprEqn], results: Sequence) -> set[Var]:
     """Return the variables to compute once."""
-    users: Counter = Counter(results)
+    users: Counter = Counter(_large(results))
     for eqn in eqns:
         for variable in _large(eqn.invars):
             users[variable] += _repeats(eqn)

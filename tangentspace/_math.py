@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Shaped
 
 
 def dot(
@@ -16,12 +16,16 @@ def dot(
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
 
 
-def stack3(
-    x: Float[Array, "..."], y: Float[Array, "..."], z: Float[Array, "..."]
-) -> Float[Array, "... 3"]:
-    """Stack three arrays along a new last axis; on a CPU twice as fast as ``jnp.stack``."""
-    axis = jnp.arange(3)
-    return jnp.where(axis == 0, x[..., None], jnp.where(axis == 1, y[..., None], z[..., None]))
+def stack_last(*columns: Shaped[Array, "..."]) -> Shaped[Array, "... n"]:
+    """Stack arrays of one shape along a new last axis; on a CPU twice as fast as ``jnp.stack``.
+
+    There all that led to them would be done in the one loop that stacks.
+    """
+    axis, (*others, last) = jnp.arange(len(columns)), columns
+    stacked = jnp.broadcast_to(last[..., None], (*last.shape, len(columns)))
+    for k, column in enumerate(others):
+        stacked = jnp.where(axis == k, column[..., None], stacked)
+    return stacked
 
 
 def safe_divide(

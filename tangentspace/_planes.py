@@ -21,6 +21,7 @@ from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal
 
 from ._fusion import compute_once
+from ._math import stack_last
 
 _LONGEST = 4  # coordinates of a short vector
 _FEWEST = 256  # vectors that are worth it
@@ -97,12 +98,7 @@ class _Vectors:
     def whole(self) -> Any:
         """The array."""
         if self._whole is None:
-            # On a CPU better than ``jnp.stack``, in whose loop all that came before is done.
-            axis, (*others, last) = jnp.arange(self.shape[-1]), self.full
-            whole = jnp.broadcast_to(last[..., None], self.shape)
-            for k, plane in enumerate(others):
-                whole = jnp.where(axis == k, plane[..., None], whole)
-            self._whole = whole
+            self._whole = stack_last(*self.full)
         return self._whole
 
 
@@ -155,8 +151,8 @@ def _evaluate(traced: ClosedJaxpr, given: Sequence) -> list:
 
 def _apply(eqn: JaxprEqn, inputs: list) -> Sequence:
     """Return the results of one operation."""
-    result: Any = eqn.outvars[0]
-    name, shape = eqn.primitive.name, result.aval.shape
+    name, first = eqn.primitive.name, next(iter(eqn.outvars), None)
+    shape = getattr(getattr(first, "aval", None), "shape", ())
     if name in ("jit", "pjit", "closed_call"):
         return _evaluate(eqn.params["jaxpr"], inputs)
     if any(isinstance(value, _Vectors) for value in inputs) or _is_short(shape):
@@ -167,7 +163,8 @@ def _apply(eqn: JaxprEqn, inputs: list) -> Sequence:
     inputs, params = [_whole(value) for value in inputs], eqn.primitive.get_bind_params(eqn.params)
     bind = functools.partial(eqn.primitive.bind, *inputs, **params)
     # Which coordinate a mask of three means, for one, must be known now.
-    results = _known(bind, *inputs) if math.prod(shape) <= _LONGEST else bind()
+    now = math.prod(shape) <= _LONGEST and not eqn.effects
+    results = _known(bind, *inputs) if now else bind()
     return results if eqn.primitive.multiple_results else [results]
 
 
@@ -273,6 +270,8 @@ def _transpose(eqn: JaxprEqn, inputs: list, shape: _Shape) -> Any:
 
 
 def _reduce(eqn: JaxprEqn, inputs: list, shape: _Shape) -> Any:
+    if not isinstance(inputs[0], _Vectors):
+        return None
     planes, last = inputs[0].full, len(inputs[0].shape) - 1
     axes = tuple(axis for axis in eqn.params["axes"] if axis != last)
     if last in eqn.params["axes"]:

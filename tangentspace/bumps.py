@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ._math import dot, safe_normalize, stack3
+from ._math import dot, safe_normalize, stack_last
 from .lighting import Colors, Scalars, reflect
 from .tangent_lighting import (
     Matrix,
@@ -73,7 +73,7 @@ def bump_normals(
     flat = squared >= size
     x, y = jnp.where(flat, 0.0, x), jnp.where(flat, 0.0, y)
     shrink = jnp.where(flat, 1.0, shrink)
-    return stack3(x * shrink, y * shrink, shrink)
+    return stack_last(x * shrink, y * shrink, shrink)
 
 
 def bump_vectors(
@@ -109,7 +109,7 @@ def bump_vectors(
     return BumpVectors(
         *(
             safe_normalize(
-                stack3(dot(tangent, vector), dot(bitangent, vector), dot(normal, vector))
+                stack_last(dot(tangent, vector), dot(bitangent, vector), dot(normal, vector))
             )
             for vector in (light_view, from_eye)
         )

@@ -32,7 +32,7 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
-from ._math import safe_normalize, stack3
+from ._math import safe_normalize, stack_last
 from .lighting import reflect
 from .texture import Taps, gather_flat
 
@@ -188,7 +188,7 @@ def view_directions(
     y = 1 - (2 * jnp.arange(height, dtype=across.dtype) + 1)[:, None] / height
     middle, along_x = jnp.cross(up, across), jnp.cross(forward, up)
     along_y = jnp.cross(across, forward)
-    return stack3(*(middle[k] + x * along_x[k] + y * along_y[k] for k in range(3)))
+    return stack_last(*(middle[k] + x * along_x[k] + y * along_y[k] for k in range(3)))
 
 
 def cube_map_from_function(
@@ -289,7 +289,7 @@ def _centres(size: int) -> Float[np.ndarray, " size"]:
 
 def _on_face(face: int, s: Float[Array, "..."], t: Float[Array, "..."]) -> Float[Array, "... 3"]:
     """Return the points of a face's plane, at distance 1 from the cube's centre."""
-    return stack3(*(m + s * a + t * b for m, a, b in zip(*_AXES[face], strict=True)))
+    return stack_last(*(m + s * a + t * b for m, a, b in zip(*_AXES[face], strict=True)))
 
 
 def _along_edges(faces: Float[Array, "6 n n c"]) -> Float[Array, "6 4 n c"]:

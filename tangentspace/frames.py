@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ._columns import columns_of
-from ._math import dot, safe_normalize, stack3
+from ._math import dot, safe_normalize, stack_last
 from ._sides import angle_seen_along, rounding, sides_of
 from .vertex_normals import Faces, Positions, _checked
 
@@ -214,7 +214,7 @@ def to_tangent(
         bitangent: The frames' second axes.
         normal: The frames' third axes.
     """
-    return stack3(*(dot(axis, vectors_world) for axis in (tangent, bitangent, normal)))
+    return stack_last(*(dot(axis, vectors_world) for axis in (tangent, bitangent, normal)))
 
 
 def _across(vectors: Float[Array, "... 3"], unit: Float[Array, "... 3"]) -> Float[Array, "... 3"]:

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ._math import dot, safe_divide, safe_normalize, stack3
+from ._math import dot, safe_divide, safe_normalize, stack_last
 from .texture import Wrap, repeat
 
 Vectors = Float[Array | np.ndarray, "... 3"]
@@ -99,7 +99,7 @@ def snap_flat(texels: Float[Array | np.ndarray, "..."], *, bits: int = 8) -> Flo
 def flip_green(normals: Vectors) -> Float[Array, "... 3"]:
     """Turn vectors of a -Y map (DirectX) into those of a +Y map (OpenGL), or back."""
     x, y, z = _components(normals, "flip_green", "normals")
-    return stack3(x, -y, z)
+    return stack_last(x, -y, z)
 
 
 def rebuild_z(xy: Float[Array | np.ndarray, "... 2"]) -> Float[Array, "... 3"]:
@@ -124,7 +124,7 @@ def rebuild_z(xy: Float[Array | np.ndarray, "... 2"]) -> Float[Array, "... 3"]:
     squared = 1 - x * x - y * y
     outside = squared <= 0
     z = jnp.where(outside, 0.0, jnp.sqrt(jnp.where(outside, 1.0, squared)))
-    return stack3(x, y, z)
+    return stack_last(x, y, z)
 
 
 def normals_from_heights(
@@ -163,7 +163,7 @@ def normals_from_heights(
     right, left = (heights[:, wrap_u(columns + step, shape[1])] for step in (1, -1))
     lower, upper = (heights[wrap_v(rows + step, shape[0])] for step in (1, -1))
     slope_u, slope_v = (right - left) * (shape[1] / 2), (upper - lower) * (shape[0] / 2)
-    return safe_normalize(stack3(-slope_u, -slope_v, jnp.ones_like(slope_u)))
+    return safe_normalize(stack_last(-slope_u, -slope_v, jnp.ones_like(slope_u)))
 
 
 def blend_normals(base: Vectors, detail: Vectors) -> Float[Array, "... 3"]:
@@ -187,9 +187,9 @@ def blend_normals(base: Vectors, detail: Vectors) -> Float[Array, "... 3"]:
         result is opposite to ``detail`` in z, and the derivative in ``base`` zero.
     """
     x, y, z = _components(base, "blend_normals", "base")
-    bent = stack3(x, y, z + 1)
+    bent = stack_last(x, y, z + 1)
     x, y, z = _components(detail, "blend_normals", "detail")
-    turned = stack3(-x, -y, z)
+    turned = stack_last(-x, -y, z)
     return bent * safe_divide(dot(bent, turned), bent[..., 2])[..., None] - turned
 
 
@@ -210,7 +210,7 @@ def scale_normals(normals: Vectors, strength: Scalars) -> Float[Array, "... 3"]:
         Smooth but where nothing is left; the derivative there is zero.
     """
     x, y, z = _components(normals, "scale_normals", "normals")
-    return safe_normalize(stack3(x * strength, y * strength, z))
+    return safe_normalize(stack_last(x * strength, y * strength, z))
 
 
 class Slopes(NamedTuple):
@@ -267,7 +267,7 @@ def normals_from_slopes(slopes: Float[Array | np.ndarray, "... 2"]) -> Float[Arr
     slopes = jnp.asarray(slopes)
     p, q = slopes[..., 0], slopes[..., 1]
     z = 1 / jnp.sqrt(1 + p * p + q * q)
-    return stack3(-p * z, -q * z, z)
+    return stack_last(-p * z, -q * z, z)
 
 
 def _components(

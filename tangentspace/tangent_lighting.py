@@ -24,7 +24,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from ._math import dot, safe_normalize, stack3
+from ._math import dot, safe_normalize, stack_last
 from .lighting import ShadingFunction, phong
 from .normal_map import decode_normals
 
@@ -79,13 +79,13 @@ def transform_directions(
 ) -> Float[Array, "... 3"]:
     """Apply a 3x3 matrix to directions, in full precision on every device."""
     x, y, z = (dot(directions, row) for row in jnp.asarray(matrix))
-    return stack3(x, y, z)
+    return stack_last(x, y, z)
 
 
 def view_positions(view_from_model: Matrix, positions: Vectors) -> Float[Array, "... 3"]:
     """Apply an affine matrix to positions, in full precision on every device."""
     x, y, z = (dot(positions, row[:3]) + row[3] for row in jnp.asarray(view_from_model)[:3])
-    return stack3(x, y, z)
+    return stack_last(x, y, z)
 
 
 def tangent_space_vectors(
@@ -122,7 +122,7 @@ def tangent_space_vectors(
     to_camera = -view_positions(view_from_model, positions)
     return TangentSpaceVectors(
         *(
-            stack3(dot(tangent, vector), dot(bitangent, vector), dot(normal, vector))
+            stack_last(dot(tangent, vector), dot(bitangent, vector), dot(normal, vector))
             for vector in (to_light_view, to_camera)
         )
     )

@@ -20,8 +20,8 @@ from shadows.bias import CombinedBias, ConstantBias, NormalOffsetBias, SlopeBias
 from shadows.compare import HardCompare
 from shadows.filters import NearestFilter
 from shadows.lights import DirectionalLight
-from shadows.render import surface_visibility
 from shadows.transforms import PerspectiveCamera, look_at
+from shadows.visibility import surface_visibility
 from shadows.window_filters import BilinearFilter
 from tangentspace.shapes import merge, plane
 

@@ -5,8 +5,6 @@ import platform
 import subprocess
 import sys
 
-import pytest
-
 PROGRAM = """
 import json, resource, sys
 import jax, jax.numpy as jnp
@@ -27,10 +25,9 @@ print(json.dumps([keep_freed_memory(), fresh, min(faults() for _ in range(6))]))
 """
 
 
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="of glibc")
 def test_freed_memory_is_used_again():
     """Measured: 50 534 pages asked for in five calls, then at most 13 after some more calls."""
     run = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, check=True)
     kept, fresh, again = json.loads(run.stdout)
-    assert kept
-    assert again < 0.2 * fresh
+    assert kept == (platform.libc_ver()[0] == "glibc")
+    assert again < 0.2 * fresh or not kept

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tangentspace import BlinnPhongShading
-from tangentspace._math import dot, safe_divide, safe_norm, safe_normalize, stack3
+from tangentspace._math import dot, safe_divide, safe_norm, safe_normalize, stack_last
 from tangentspace._planes import in_planes
 
 RANDOM = np.random.default_rng(0)
@@ -22,7 +22,7 @@ FUNCTIONS = {
     "cosine": lambda a, b: dot(safe_normalize(a), safe_normalize(b)),
     "lengths": lambda a, b: safe_norm(a) * b[..., 1],
     "stack": lambda a, b: jnp.stack([a[..., 0], b[..., 2], a[..., 1] * b[..., 0]], axis=-1),
-    "stack3": lambda a, b: stack3(a[..., 0], b[..., 2], a[..., 1]) + b,
+    "stack_last": lambda a, b: stack_last(a[..., 0], b[..., 2], a[..., 1]) + b,
     "scaled by a column": lambda a, b: safe_divide(a[..., :1], b[..., 1:2]) * a,
     "scaled by a row": lambda a, b: a * jnp.array([1.0, 2.0, 3.0]) + b[:1, :1],
     "scaled by a number": lambda a, b: 2 * a - jnp.mean(b),
@@ -30,6 +30,7 @@ FUNCTIONS = {
     "chosen": lambda a, b: jnp.where(a[..., :1] > 0, a, jnp.where(b > a, b, 1.0)),
     "clipped": lambda a, b: jnp.clip(a, -0.5, 0.5) + jnp.clip(b, a, 1.0),
     "sums": lambda a, b: jnp.sum(a * b, axis=-1) + jnp.sum(b, axis=(0, 2)) + jnp.sum(a, 1)[:, :1],
+    "sums of longer rows": lambda a, b: jnp.sum(a[..., None] * jnp.arange(9.0), axis=-1) * b,
     "extremes": lambda a, b: jnp.max(a, axis=-1) - jnp.min(b, axis=(0, 1, 2)),
     "all of them": lambda a, b: jnp.where(jnp.all(a > -1, axis=-1)[..., None], a, b),
     "any of them": lambda a, b: jnp.where(jnp.any(b > 1, axis=-1), a[..., 0], jnp.prod(b, -1)),
@@ -44,6 +45,7 @@ FUNCTIONS = {
     "joined": lambda a, b: jnp.concatenate([a, b[..., :1]], axis=-1)[..., ::-1],
     "joined in rows": lambda a, b: jnp.concatenate([a, b], axis=1)[:, 5:40] * 2,
     "homogeneous": lambda a, b: jnp.pad(a, ((0, 0), (0, 0), (0, 1)), constant_values=1.0) @ W,
+    "every second": lambda a, b: a[..., ::2] * b[:, ::3, 1:][:, :1],
     "padded": lambda a, b: jnp.pad(a, ((1, 1), (0, 0), (0, 0)))[1:-1] * b,
     "rolled": lambda a, b: jnp.roll(a, 1, axis=-1) * jnp.roll(b, 2, axis=0),
     "matrices": lambda a, b: jnp.einsum("hwi,ij->hwj", a, W[:3, :3]) * b,
@@ -105,9 +107,12 @@ def test_other_arguments_and_results_stay_as_they_are():
     assert np.all(rest["ids"] == 1)
 
 
-def test_what_is_not_traced_is_called_as_it_is():
-    """So are functions that others call: each is traced once."""
-    calls = []
+def test_what_is_not_traced_is_called_as_it_is(monkeypatch):
+    """So are functions that others call: the whole is traced twice, in rows and in planes."""
+    calls, traces = [], []
+    module, trace = sys.modules["tangentspace._planes"], jax.make_jaxpr
+    count = lambda function: traces.append(function) or trace(function)
+    monkeypatch.setattr(module.jax, "make_jaxpr", count)
 
     @in_planes
     def inner(a):
@@ -120,6 +125,28 @@ def test_what_is_not_traced_is_called_as_it_is():
     calls.clear()
     jax.jit(outer)(A)
     assert calls == [True, True]
+    assert len(traces) == 2
+
+
+def test_numbers_are_results_and_calls_back_are_made_once():
+    """A constant result, and what says something but returns nothing, as ``jax.debug.print``."""
+    said = []
+
+    @in_planes
+    def function(a):
+        jax.debug.callback(lambda: said.append("known"))
+        jax.debug.callback(lambda total: said.append(float(total)), jnp.sum(a))
+        return jnp.float32(2.0), jnp.ones((300, 3)), a
+
+    run = jax.jit(lambda a: function(a))
+    run.lower(A).compile()
+    assert said == []
+    number, ones, a = run(A)
+    jax.effects_barrier()
+    assert number == 2
+    assert np.all(ones == 1)
+    np.testing.assert_array_equal(a, A)
+    assert len(said) == 2
 
 
 def test_what_is_closed_over_is_traced_too():

@@ -28,11 +28,12 @@ from shadows.layouts import Layout, SingleLayout
 from shadows.light_map import LightMap, look_up_light, shade_with_light_map
 from shadows.lights import Light, PointLight
 from shadows.medium import Medium
-from shadows.render import Rendering, default_bias, shade, surface_visibility
+from shadows.render import Rendering, shade
 from shadows.shadow_map import ShadowMap, render_shadow_map
 from shadows.shafts import add_shafts
 from shadows.silhouettes import mesh_edges
 from shadows.surface import Surface, render_surface
+from shadows.visibility import default_bias, surface_visibility
 from shadows.volumes import volume_visibility
 from shadows.window_filters import BilinearFilter, PCFFilter, TentFilter
 

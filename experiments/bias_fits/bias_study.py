@@ -19,8 +19,9 @@ from shadows.bias import Bias, CombinedBias
 from shadows.compare import Compare, HardCompare
 from shadows.filters import Filter, look_up
 from shadows.layouts import Layout, SingleLayout
-from shadows.render import Rendering, receive_surface
+from shadows.render import Rendering
 from shadows.shadow_map import Receiver, ShadowMap
+from shadows.visibility import receive_surface
 from tangentspace._math import dot
 from tangentspace.shading import Shading
 

@@ -11,7 +11,7 @@ from shadows.area_lights import AreaLight
 from shadows.bias import Bias, CombinedBias
 from shadows.filters import Filter
 from shadows.lights import Light
-from shadows.render import check_techniques, default_bias
+from shadows.visibility import check_techniques, default_bias
 
 from ..checks import check_folder, check_reach, check_scene, check_size, check_target, make_folder
 from ..console import say, say_notes, stage

@@ -11,7 +11,7 @@ import tyro
 from jaxtyping import Float
 
 from shadows.bias import Bias
-from shadows.render import check_techniques, default_bias
+from shadows.visibility import check_techniques, default_bias
 
 from ..checks import check_folder, check_reach, check_scene, check_size, check_target
 from ..files.images import read_image

@@ -18,10 +18,11 @@ from shadows.filters import Filter
 from shadows.layouts import CubeLayout, Layout
 from shadows.lights import Light
 from shadows.plane_bias import AdaptiveBias
-from shadows.render import shade, surface_visibility
+from shadows.render import shade
 from shadows.shadow_map import ShadowMap, render_shadow_map
 from shadows.surface import Surface
 from shadows.transforms import Camera
+from shadows.visibility import surface_visibility
 from tangentspace.mesh import Mesh
 
 from ..metrics import soft_shadow_errors

@@ -18,9 +18,9 @@ from shadows.bias import Bias
 from shadows.compare import HardCompare
 from shadows.filters import Filter
 from shadows.lights import Light
-from shadows.render import surface_visibility
 from shadows.shadow_map import ShadowMap
 from shadows.surface import Surface
+from shadows.visibility import surface_visibility
 
 from ..frontier.programs import Programs, Timed, run_times
 from ..frontier.shadow_method import draw_map, prepare_map

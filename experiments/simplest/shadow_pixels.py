@@ -15,10 +15,10 @@ from jaxtyping import Array, Bool, Float
 
 from shadows.layouts import Layout
 from shadows.lights import Light
-from shadows.render import receive_surface
 from shadows.shadow_map import Receiver, ShadowMap
 from shadows.surface import Surface
 from shadows.transforms import Camera
+from shadows.visibility import receive_surface
 
 from .sight import Seen, Share, Sight, picture_of
 

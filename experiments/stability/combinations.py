@@ -23,10 +23,10 @@ from shadows.four_moment_filter import MSMFilter
 from shadows.layer_bias import FrontFaceCullingBias, MidpointBias, SecondDepthBias
 from shadows.pcss_filter import PCSSFilter
 from shadows.plane_bias import AdaptiveBias, ReceiverPlaneBias
-from shadows.render import default_bias
 from shadows.shadow_map import Receiver
 from shadows.transforms import Scalar
 from shadows.variance_filter import VSMFilter
+from shadows.visibility import default_bias
 from shadows.window_filters import BilinearFilter, PCFFilter, TentFilter
 
 CONSTANT = 0.1  # world length of the constant bias
