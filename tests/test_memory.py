@@ -29,7 +29,7 @@ print(json.dumps([kept, sorted(faults() for _ in range(25))[12]]))
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc is told")
 def test_freed_memory_is_used_again():
-    """Median of 25 calls, two arrays of 16 MiB each. Measured: 8 467 pages asked for, or at most 2."""
+    """Median of 25 calls of two arrays of 16 MiB. Measured: 8 467 pages, or at most 2."""
 
     def median_faults(memory: str) -> tuple[bool, int]:
         command = [sys.executable, "-c", PROGRAM, memory]
