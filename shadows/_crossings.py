@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Int, PyTree
 
+from tangentspace._fusion import unknown_one
 from tangentspace._math import safe_divide
 
 from ._fragments import get
@@ -19,6 +20,7 @@ from .silhouettes import MeshEdges
 
 _PIECE = 2**11  # ways looked at together
 _PAIRS = 2**15  # of texels that are listed together
+_LAST = 2**8  # ways that are walked on to the end when no others are left
 _STEPS = 64  # faces that are followed from a texel to its neighbour
 _ROUNDING = 2.0**-10  # of a texel: no edge is so near to a centre
 _EQUAL = 2.0**-16  # window depths so close are the same
@@ -71,8 +73,8 @@ class _Walker(NamedTuple):
     Attributes:
         pair: As in ``_Walks``.
         leg: 0 on the way, 1 on the way back, -1 idle.
-        face: Where it is.
-        came_by: The edge over which it came there; -1 at the start.
+        corner: Of the face where it is, from which the edge leads over which it came; -1 at the
+            start.
         crease: The first that it came over on this leg; -1 if none.
         steps: Made on this leg.
         end: Found on leg 0.
@@ -81,8 +83,7 @@ class _Walker(NamedTuple):
 
     pair: Index
     leg: Index
-    face: Index
-    came_by: Index
+    corner: Index
     crease: Index
     steps: Index
     end: Index
@@ -90,29 +91,21 @@ class _Walker(NamedTuple):
 
 
 class Links(NamedTuple):
-    """Which faces lie beside each other in the image.
+    """Which faces lie beside each other in the image; corner 3 face + i is the face's i-th.
 
     Attributes:
-        edge_ids: The edge from each corner of a face to the next one.
-        runs: +1 where the face, turned to the viewer, runs forward along that edge, or -1.
-        forward: A face that runs forward along an edge; past the last face if there is none.
-        backward: A face that runs backward.
+        edge_ids: The edge from each corner to the next one of its face.
+        across: The corner from which the face beyond that edge runs back along it; -1 if none.
         vertices: The two ends of each edge.
         creases: Where one look of the surface ends and another begins.
+        outline: Where the surface ends or turns back, or its look changes.
     """
 
-    edge_ids: tuple[Int[Array, " faces"], ...]
-    runs: tuple[Int[Array, " faces"], ...]
-    forward: Int[Array, " edges"]
-    backward: Int[Array, " edges"]
+    edge_ids: Int[Array, " corners"]
+    across: Int[Array, " corners"]
     vertices: tuple[Int[Array, " edges"], ...]
     creases: Bool[Array, " edges"]
-
-    @property
-    def outline(self) -> Bool[Array, " edges"]:
-        """Where the surface ends or turns back, or its look changes."""
-        none = self.edge_ids[0].size
-        return ((self.forward == none) != (self.backward == none)) | self.creases
+    outline: Bool[Array, " edges"]
 
 
 def find_crossings(
@@ -192,23 +185,25 @@ def _put(
 
 def link_faces(screen: Screen, edges: MeshEdges, creases: Bool[Array, " edges"] | None) -> Links:
     """Find which faces lie beside each other in the image."""
-    edge_ids = jnp.asarray(edges.edge_ids)
+    edge_ids = jnp.asarray(edges.edge_ids).reshape(-1)
     corners = jnp.stack(screen.corners)
     area = signed_area(*(get(axis, corners) for axis in (screen.column, screen.row, screen.w)))
-    turned = jnp.where(area < 0, -1, 1).astype(jnp.int32)
-    runs = turned[:, None] * jnp.asarray(edges.directions)
-    face_count, edge_count = edge_ids.shape[0], edges.vertices.shape[0]
-    face = jnp.broadcast_to(jnp.arange(face_count, dtype=jnp.int32)[:, None], runs.shape)
+    turned = jnp.where(area < 0, -1, 1)
+    runs = (turned[:, None] * jnp.asarray(edges.directions)).reshape(-1)
+    corner, count = jnp.arange(edge_ids.size, dtype=jnp.int32), edges.vertices.shape[0]
 
-    def first(chosen: Bool[Array, "faces 3"]) -> Int[Array, " edges"]:
-        none = jnp.full(edge_count, face_count, jnp.int32)
-        return none.at[jnp.where(chosen, edge_ids, edge_count)].min(face, mode="drop")
+    def first(chosen: Bool[Array, " corners"]) -> Int[Array, " edges"]:
+        none = jnp.full(count, edge_ids.size, jnp.int32)
+        found = none.at[jnp.where(chosen, edge_ids, count)].min(corner, mode="drop")
+        return jnp.where(found < edge_ids.size, found, -1)
 
-    ends = tuple(jnp.asarray(edges.vertices).T)
+    ahead, back = first(runs > 0), first(runs < 0)
+    across = jnp.where(runs > 0, get(back, edge_ids), get(ahead, edge_ids))
+    outline = (ahead < 0) != (back < 0)
     if creases is None:
-        creases = jnp.zeros(edge_count, bool)
-    parts = first(runs > 0), first(runs < 0), ends, creases
-    return Links(tuple(edge_ids.T), tuple(runs.T), *parts)
+        creases = jnp.zeros(count, bool)
+    ends = tuple(jnp.asarray(edges.vertices).T)
+    return Links(edge_ids, across, ends, creases, outline | creases)
 
 
 def _follow(
@@ -222,12 +217,12 @@ def _follow(
     """Follow the surfaces seen at both ends of each way towards the other end.
 
     A few walkers go one step at a time, and who is done takes up the next way: most arrive
-    after a step or two, some need many.
+    after a step or two, some need many. The last go on in a smaller group.
 
     Returns:
         Walks, but of those ways where one surface leads from end to end, and how many.
     """
-    none, idle = screen.corners[0].size, jnp.full(_PIECE, -1, jnp.int32)
+    at_corners = screen.at_corners()
 
     def step(carry: tuple) -> tuple:
         taken, walker, walks, count = carry
@@ -237,15 +232,16 @@ def _follow(
         pair = jnp.where(starts, pairs.at[turn].get(mode="clip"), walker.pair)
         leg = jnp.where(starts, 0, walker.leg)
         ways = _ways(pair, width, ids.size)
-        texel, side = jnp.where(leg == 1, jnp.stack(ways.back[:2]), jnp.stack(ways[:2]))
-        ways = Ways(texel, side, width)
-        face = jnp.where(walker.came_by < 0, get(ids, ways.texel), walker.face)
+        back = ways.back
+        texel = jnp.where(leg == 1, back.texel, ways.texel)
+        ways = Ways(texel, jnp.where(leg == 1, back.side, ways.side), width)
+        face = jnp.where(walker.corner < 0, get(ids, ways.texel), walker.corner // 3)
         far = get(ids, ways.other)
 
-        along, edge, run = _leave(screen, links, ways, jnp.maximum(face, 0), walker.came_by)
-        next_face = jnp.where(run > 0, get(links.backward, edge), get(links.forward, edge))
-        lost = (face < 0) | (run == 0) | (walker.steps >= _STEPS)
-        passed, ended = ~lost & (along > 1), ~lost & (along <= 1) & (next_face == none)
+        along, by = _leave(at_corners, ways, jnp.maximum(face, 0), walker.corner)
+        edge, beyond = get(links.edge_ids, by), get(links.across, by)
+        lost = (face < 0) | (along == -jnp.inf) | (walker.steps >= _STEPS)
+        passed, ended = ~lost & (along > 1), ~lost & (along <= 1) & (beyond < 0)
         done = (leg >= 0) & (lost | passed | ended)
         crossed = get(links.creases, edge) & (walker.crease < 0)
         arrived = passed & (face == far)
@@ -254,25 +250,30 @@ def _follow(
 
         both = _Walks(pair, (walker.end, end), (walker.last, last))
         walks, count = _put(walks, both, done & (leg == 1), count)
-        back = done & (leg == 0) & ~(arrived & (end < 0))
+        returns = done & (leg == 0) & ~(arrived & (end < 0))
         walker = _Walker(
             pair,
-            jnp.where(back, 1, jnp.where(done, -1, leg)),
-            next_face,
-            jnp.where(done, -1, edge),
+            jnp.where(returns, 1, jnp.where(done, -1, leg)),
+            jnp.where(done, -1, beyond),
             jnp.where(done, -1, jnp.where(crossed, edge, walker.crease)),
             jnp.where(done, 0, walker.steps + 1),
-            jnp.where(back, end, walker.end),
-            jnp.where(back, last, walker.last),
+            jnp.where(returns, end, walker.end),
+            jnp.where(returns, last, walker.last),
         )
         return jnp.minimum(taken + jnp.sum(free, dtype=jnp.int32), total), walker, walks, count
 
-    going = lambda carry: (carry[0] < total) | jnp.any(carry[1].leg >= 0)
+    def go(carry: tuple, rest: int) -> tuple:
+        """Go on until so many are left."""
+        more = lambda carry: (carry[0] < total) | (jnp.sum(carry[1].leg >= 0) > rest)
+        return lax.while_loop(more, step, carry)
+
+    idle = lambda size: _Walker(*(jnp.full(size, -1, jnp.int32),) * len(_Walker._fields))
     empty = jnp.zeros_like(pairs)
     walks = _Walks(empty, (empty, empty), (empty, empty))
-    walker = _Walker(idle, idle, idle, idle, idle, jnp.zeros_like(idle), idle, idle)
-    _, _, walks, count = lax.while_loop(going, step, (jnp.int32(0), walker, walks, jnp.int32(0)))
-    return walks, count
+    taken, walker, *found = go((jnp.int32(0), idle(_PIECE), walks, jnp.int32(0)), _LAST)
+    walker, _ = _put(idle(_LAST), walker, walker.leg >= 0, jnp.int32(0))
+    _, _, *found = go((taken, walker, *found), 0)
+    return tuple(found)
 
 
 def _is_plain(
@@ -283,11 +284,12 @@ def _is_plain(
     Nothing else can be crossed there, and most ways are such.
     """
     faces = get(ids, ways.texel), get(ids, ways.other)
-    here, there = (jnp.maximum(face, 0) for face in faces)
-    edges, edge = [get(column, there) for column in links.edge_ids], jnp.full_like(here, -1)
-    for column in links.edge_ids:
-        this = get(column, here)
-        shared = (this == edges[0]) | (this == edges[1]) | (this == edges[2])
+    here, there = (
+        [get(links.edge_ids, 3 * jnp.maximum(face, 0) + k) for k in range(3)] for face in faces
+    )
+    edge = jnp.full_like(ways.texel, -1)
+    for this in here:
+        shared = (this == there[0]) | (this == there[1]) | (this == there[2])
         edge = jnp.where(shared, this, edge)
     meet, edge = edge >= 0, jnp.maximum(edge, 0)
     inside = meet & ~get(links.creases, edge)
@@ -301,27 +303,25 @@ def _ways(pair: Index, width: int, texels: int) -> Ways:
     return Ways(pair % texels, 2 * (pair // texels), width)
 
 
-def _leave(
-    screen: Screen, links: Links, ways: Ways, face: Index, came_by: Index
-) -> tuple[Length, Index, Index]:
-    """Return where a face is left: how far along the way, by which edge, and how it runs there.
+def _leave(at_corners: Screen, ways: Ways, face: Index, came_by: Index) -> tuple[Length, Index]:
+    """Return where a face is left: how far along the way, and from which corner the edge leads.
 
-    The last is 0 where the way does not cross the face.
+    The first is -inf where the way does not cross the face.
     """
-    points = [place(screen, ways, corner) for corner in screen.corners_of(face)]
-    farthest = jnp.full(face.shape, -jnp.inf, screen.w.dtype)
-    by, run = jnp.zeros_like(face), jnp.zeros_like(face)
+    corners = [3 * face + k for k in range(3)]
+    points = [place(at_corners, ways, corner) for corner in corners]
+    farthest, by = jnp.full(face.shape, -jnp.inf, at_corners.w.dtype), corners[0]
+    one = unknown_one().astype(farthest.dtype)
     for k in range(3):
         a, b = points[k], points[(k + 1) % 3]
         crosses = (a.across >= 0) != (b.across >= 0)
         w = a.w * b.across - b.w * a.across
         in_front = jnp.where(b.across >= 0, w, -w) > 0
         along = jnp.where(in_front, edge_crossing(a, b), jnp.inf)
-        this = get(links.edge_ids[k], face)
-        take = crosses & (this != came_by) & (along > farthest)
-        farthest, by = jnp.where(take, along, farthest), jnp.where(take, this, by)
-        run = jnp.where(take, get(links.runs[k], face), run)
-    return farthest, by, run
+        along = jnp.where(crosses & (corners[k] != came_by), along, -jnp.inf) / one
+        by = jnp.where(along > farthest, corners[k], by)
+        farthest = jnp.maximum(along, farthest)
+    return farthest, by
 
 
 def _meet(

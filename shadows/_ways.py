@@ -44,6 +44,13 @@ class Screen(NamedTuple):
         column, row, depth = 0.5 * width * (w + x), 0.5 * height * (w - y), 0.5 * (w + z)
         return Screen(column, row, depth, w, tuple(jnp.asarray(faces, jnp.int32).T))
 
+    def at_corners(self) -> "Screen":
+        """Return the same with vertices of its own for each corner, three from each face on."""
+        corners = jnp.stack(self.corners, axis=1).reshape(-1)
+        column, row, depth, w = (get(axis, corners) for axis in self[:4])
+        each = tuple(jnp.arange(corners.size, dtype=jnp.int32).reshape(-1, 3).T)
+        return Screen(column, row, depth, w, each)
+
     def corners_of(self, face: Index) -> list[Index]:
         """Return the vertices of faces; those of face 0 where there is none."""
         return [get(corner, jnp.maximum(face, 0)) for corner in self.corners]

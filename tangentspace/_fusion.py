@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 import jax.numpy as jnp
-from jax import lax
+from jax import Array, lax
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var
 
 _LONG = 8  # operations that are not worth to be done twice
@@ -30,12 +30,17 @@ _ONCE = frozenset({
 # fmt: on
 
 
+def unknown_one() -> Array:
+    """Return a one; values divided by it are computed once for all who use them."""
+    return lax.optimization_barrier(jnp.ones(()))
+
+
 def compute_once(traced: ClosedJaxpr, given: Sequence) -> Sequence:
     """Return the results of a traced function; long chains in it are computed once.
 
     Derivatives of the result are, too: what is divided forward is divided backward.
     """
-    jaxpr, one = traced.jaxpr, lax.optimization_barrier(jnp.ones(()))
+    jaxpr, one = traced.jaxpr, unknown_one()
     values: dict = dict(zip(jaxpr.constvars, traced.consts, strict=True))
     values.update(zip(jaxpr.invars, given, strict=True))
     read = lambda atom: atom.val if isinstance(atom, Literal) else values[atom]
