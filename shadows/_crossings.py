@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Int, PyTree
 
-from tangentspace._fusion import unknown_one
+from tangentspace._fusion import once
 from tangentspace._math import safe_divide
 
 from ._fragments import get
@@ -311,14 +311,13 @@ def _leave(at_corners: Screen, ways: Ways, face: Index, came_by: Index) -> tuple
     corners = [3 * face + k for k in range(3)]
     points = [place(at_corners, ways, corner) for corner in corners]
     farthest, by = jnp.full(face.shape, -jnp.inf, at_corners.w.dtype), corners[0]
-    one = unknown_one().astype(farthest.dtype)
     for k in range(3):
         a, b = points[k], points[(k + 1) % 3]
         crosses = (a.across >= 0) != (b.across >= 0)
         w = a.w * b.across - b.w * a.across
         in_front = jnp.where(b.across >= 0, w, -w) > 0
         along = jnp.where(in_front, edge_crossing(a, b), jnp.inf)
-        along = jnp.where(crosses & (corners[k] != came_by), along, -jnp.inf) / one
+        along = once(jnp.where(crosses & (corners[k] != came_by), along, -jnp.inf))
         by = jnp.where(along > farthest, corners[k], by)
         farthest = jnp.maximum(along, farthest)
     return farthest, by

@@ -16,6 +16,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from tangentspace._fusion import once
+
 _BLOCK = 64
 Triple = list[Float[Array, " items"]]
 Corners = Float[Array, "corners=3 faces"]
@@ -46,13 +48,13 @@ def prefix_sum(counts: Int[Array, " items"]) -> Int[Array, " items"]:
     """Return the inclusive sums of numbers of at most 2**14 each.
 
     Within blocks by a product with a triangular matrix, which is exact in float32 in that
-    range; four times as fast on a CPU as a running sum.
+    range; three to four times as fast on a CPU as a running sum.
     """
     size = counts.shape[0]
     blocks = jnp.pad(counts, (0, -size % _BLOCK)).reshape(-1, _BLOCK).astype(jnp.float32)
     upper = jnp.triu(jnp.ones((_BLOCK, _BLOCK), jnp.float32))
     within = jnp.matmul(blocks, upper, precision="highest").astype(jnp.int32)
-    before = jnp.cumsum(within[:, -1], dtype=jnp.int32) - within[:, -1]
+    before = once(jnp.cumsum(within[:, -1], dtype=jnp.int32) - within[:, -1])
     return (within + before[:, None]).reshape(-1)[:size]
 
 

@@ -29,12 +29,13 @@ References:
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
 from tangentspace._math import safe_divide, stack_last
@@ -59,6 +60,7 @@ from .silhouettes import MeshEdges
 
 _CORNER = 0.5  # texels from a corner where its own steepness counts
 
+Size = TypeVar("Size")
 Result = TypeVar("Result")
 
 
@@ -146,8 +148,8 @@ def coverage(
         )
         return line_crossing(here, there), weight, weight
 
-    rests = _rests(of_edges, at_edges, (height, width), 4 * (height + width))
-    rests += _rests(of_lines, at_lines, (height, width), (height + width))
+    few = 4 * (height + width), height + width
+    rests = _rests((of_edges, of_lines), (at_edges, at_lines), (height, width), few, screen.w.dtype)
     return Coverage(rests, (at_edges, at_lines))
 
 
@@ -182,7 +184,8 @@ def neighbor_depth(
         texel = jnp.where(jnp.arange(size) < count, texel, side.size)
         return raster.depth.reshape(-1).at[texel].set(depth, mode="drop")
 
-    return _few_or_all(run, count, 4 * (height + width), side.size).reshape(height, width)
+    few = min(4 * (height + width), side.size)
+    return _few_or_all(run, count <= few, few, side.size).reshape(height, width)
 
 
 def blend_layers(
@@ -255,45 +258,55 @@ def cut_texel(ways: Ways, along: Length, height: int) -> tuple[Bool[Array, " way
 
 
 def _rests(
-    measure: Callable[[Crossings, Ways], tuple[Length, Length, Length]],
-    crossings: Crossings,
+    measures: Sequence[Callable[[Crossings, Ways], tuple[Length, Length, Length]]],
+    crossings: Sequence[Crossings],
     shape: tuple[int, int],
-    few: int,
+    few: Sequence[int],
+    dtype: DTypeLike,
 ) -> Float[Array, "4 height width"]:
     """Return how much of each texel belongs to its neighbour on each side.
 
     Args:
-        measure: Returns how far along its way each crossing is, its weight in derivatives,
-            and its weight in values.
+        measures: For each kind of crossing, what returns how far along its way each is, its
+            weight in derivatives, and its weight in values.
         crossings: Between texels.
         shape: Of the image.
-        few: As many as there usually are.
+        few: As many of each kind as there usually are.
+        dtype: Of the result.
     """
     height, width = shape
     texels = height * width
 
-    def run(size: int) -> Float[Array, " rests"]:
-        some = crossings.part(0, size)
-        ways = some.ways(width)
-        along, weight, shown = measure(some, ways)
-        along = jnp.clip(along, 0, 1)
-        own, cut = cut_texel(ways, lax.stop_gradient(along), height)
-        part = jnp.where(own, 0.5 - along, along - 0.5)
-        rest = weight * part + lax.stop_gradient((shown - weight) * part)
-        cut = jnp.where(jnp.arange(size) < crossings.total, cut, 4 * texels)
-        return jnp.zeros(4 * texels, rest.dtype).at[cut].set(rest, mode="drop")
+    def run(sizes: Sequence[int]) -> Float[Array, " rests"]:
+        rests = jnp.zeros(4 * texels, dtype)
+        for measure, found, size in zip(measures, crossings, sizes, strict=True):
+            some = found.part(0, size)
+            ways = some.ways(width)
+            along, weight, shown = measure(some, ways)
+            along = jnp.clip(along, 0, 1)
+            own, cut = cut_texel(ways, lax.stop_gradient(along), height)
+            part = jnp.where(own, 0.5 - along, along - 0.5)
+            rest = weight * part + lax.stop_gradient((shown - weight) * part)
+            cut = jnp.where(jnp.arange(size) < some.total, cut, 4 * texels)
+            rests = rests.at[cut].set(rest, mode="drop")
+        return rests
 
-    rests = _few_or_all(run, crossings.total, few, crossings.way.size)
+    most = [found.way.size for found in crossings]
+    are_few = [found.total <= size for found, size in zip(crossings, few, strict=True)]
+    few = [min(sizes) for sizes in zip(few, most, strict=True)]
+    rests = _few_or_all(run, functools.reduce(jnp.logical_and, are_few), few, most)
     return rests.reshape(4, height, width)
 
 
-def _few_or_all(run: Callable[[int], Result], count: Int[Array, ""], few: int, most: int) -> Result:
-    """Return ``run(size)`` of a size that holds the count, small where that is enough."""
-    if few >= most:
+def _few_or_all(
+    run: Callable[[Size], Result], are_few: Bool[Array, ""], few: Size, most: Size
+) -> Result:
+    """Return ``run(size)`` of a size that holds all, small where that is enough."""
+    if few == most:
         return run(most)
     # Computed again backwards: what is kept of a choice is as large as its largest way.
     ways = (jax.checkpoint(functools.partial(run, size)) for size in (few, most))
-    return lax.cond(count <= few, *ways)
+    return lax.cond(are_few, *ways)
 
 
 @jax.custom_jvp

@@ -30,9 +30,10 @@ _ONCE = frozenset({
 # fmt: on
 
 
-def unknown_one() -> Array:
-    """Return a one; values divided by it are computed once for all who use them."""
-    return lax.optimization_barrier(jnp.ones(()))
+def once(values: Array) -> Array:
+    """Return the same values, computed once for all who use them."""
+    one = lax.optimization_barrier(jnp.ones((), values.dtype))
+    return lax.div(values, jnp.broadcast_to(one, values.shape))
 
 
 def compute_once(traced: ClosedJaxpr, given: Sequence) -> Sequence:
@@ -40,7 +41,7 @@ def compute_once(traced: ClosedJaxpr, given: Sequence) -> Sequence:
 
     Derivatives of the result are, too: what is divided forward is divided backward.
     """
-    jaxpr, one = traced.jaxpr, unknown_one()
+    jaxpr, one = traced.jaxpr, lax.optimization_barrier(jnp.ones(()))
     values: dict = dict(zip(jaxpr.constvars, traced.consts, strict=True))
     values.update(zip(jaxpr.invars, given, strict=True))
     read = lambda atom: atom.val if isinstance(atom, Literal) else values[atom]

@@ -309,10 +309,7 @@ def test_more_crossings_than_there_usually_are_change_nothing(monkeypatch):
 
     usual = jax.jit(jax.value_and_grad(total))(clip)
     module = sys.modules["shadows.coverage"]
-    few_or_all = module._few_or_all
-    monkeypatch.setattr(
-        module, "_few_or_all", lambda run, n, few, most: few_or_all(run, n, 1, most)
-    )
+    monkeypatch.setattr(module, "_few_or_all", lambda run, are_few, few, most: run(most))
     # And when fewer pairs of texels are listed together than there are.
     monkeypatch.setattr(sys.modules["shadows._crossings"], "_PAIRS", 64)
     monkeypatch.setattr(sys.modules["shadows._crossings"], "_PIECE", 32)
