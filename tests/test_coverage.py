@@ -318,6 +318,24 @@ def test_more_crossings_than_there_usually_are_change_nothing(monkeypatch):
     np.testing.assert_allclose(crowded[1], usual[1], rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.parametrize(("kind", "size"), [(0, 0.15), (1, 1.5)], ids=["edges", "lines"])
+def test_none_of_many_crossings_is_left_out(monkeypatch, kind, size):
+    """Triangles all over, more crossings of a kind than the smaller program holds."""
+    rng = np.random.default_rng(0)
+    centers = rng.uniform(-0.8, 0.8, (120, 1, 3))
+    positions = (centers + rng.normal(size=(120, 3, 3)) * size).reshape(-1, 3)
+    clip = np.concatenate([positions, np.ones((360, 1))], axis=-1)
+    faces = np.arange(360, dtype=np.int32).reshape(-1, 3)
+    edges = mesh_edges(positions, faces)
+    ids = rasterize(clip, faces, image_size=(SIZE, SIZE)).face_ids
+    found = jax.jit(coverage)(clip, faces, edges, ids)
+    assert found.crossings[kind].total > (8, 2)[kind] * SIZE
+    module = sys.modules["shadows.coverage"]
+    monkeypatch.setattr(module, "_few_or_all", lambda run, are_few, few, most: run(most))
+    whole = jax.jit(lambda clip: coverage(clip, faces, edges, ids))(clip)
+    np.testing.assert_allclose(found.rests, whole.rests, atol=1e-15)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_edges_inside_a_surface_are_passed_as_by_walking(monkeypatch, seed):
     """The same shares where each way is followed from face to face, as where plain ones are not."""
