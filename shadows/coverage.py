@@ -288,7 +288,7 @@ def _rests(
             part = jnp.where(own, 0.5 - along, along - 0.5)
             rest = weight * part + lax.stop_gradient((shown - weight) * part)
             cut = jnp.where(jnp.arange(size) < some.total, cut, 4 * texels)
-            rests = rests.at[cut].set(rest, mode="drop")
+            rests = rests.at[cut].add(rest, mode="drop")
         return rests
 
     most = [found.way.size for found in crossings]
