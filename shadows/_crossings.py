@@ -127,6 +127,7 @@ def find_crossings(
     apart = jnp.concatenate([right.reshape(-1), below.reshape(-1)])
     ids, ends = face_ids.reshape(-1), prefix_sum(apart.astype(jnp.int32))
     some = min(_PAIRS, -(-apart.size // _PIECE) * _PIECE)
+    at_corners = screen.at_corners()
 
     def step(carry: tuple) -> tuple:
         first, *found = carry
@@ -134,7 +135,7 @@ def find_crossings(
         there = first + jnp.arange(some, dtype=jnp.int32) < ends[-1]
         plain = _is_plain(screen, links, _ways(pairs, width, ids.size), ids)
         others, count = marked(there & ~plain)
-        walks, count = _follow(screen, links, get(pairs, others), count, ids, width)
+        walks, count = _follow(at_corners, links, get(pairs, others), count, ids, width)
 
         def meet(carry: tuple) -> tuple:
             start, *kept = carry
@@ -207,7 +208,7 @@ def link_faces(screen: Screen, edges: MeshEdges, creases: Bool[Array, " edges"] 
 
 
 def _follow(
-    screen: Screen,
+    at_corners: Screen,
     links: Links,
     pairs: Index,
     total: Int[Array, ""],
@@ -219,10 +220,17 @@ def _follow(
     A few walkers go one step at a time, and who is done takes up the next way: most arrive
     after a step or two, some need many. The last go on in a smaller group.
 
+    Args:
+        at_corners: The mesh in the image, with vertices of their own for each face's corners.
+        links: ``link_faces`` of the mesh.
+        pairs: Ways, as in ``_Walks``.
+        total: How many are meant, from the first.
+        ids: The face seen at each texel.
+        width: Of the image.
+
     Returns:
         Walks, but of those ways where one surface leads from end to end, and how many.
     """
-    at_corners = screen.at_corners()
 
     def step(carry: tuple) -> tuple:
         taken, walker, walks, count = carry
@@ -267,7 +275,10 @@ def _follow(
         more = lambda carry: (carry[0] < total) | (jnp.sum(carry[1].leg >= 0) > rest)
         return lax.while_loop(more, step, carry)
 
-    idle = lambda size: _Walker(*(jnp.full(size, -1, jnp.int32),) * len(_Walker._fields))
+    def idle(size: int) -> _Walker:
+        none = jnp.full(size, -1, jnp.int32)
+        return _Walker(none, none, none, none, jnp.zeros_like(none), none, none)
+
     empty = jnp.zeros_like(pairs)
     walks = _Walks(empty, (empty, empty), (empty, empty))
     taken, walker, *found = go((jnp.int32(0), idle(_PIECE), walks, jnp.int32(0)), _LAST)

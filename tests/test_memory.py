@@ -5,8 +5,6 @@ import platform
 import subprocess
 import sys
 
-import pytest
-
 PROGRAM = """
 import json, resource, sys
 from experiments.memory import keep_freed_memory
@@ -27,7 +25,6 @@ print(json.dumps([kept, sorted(faults() for _ in range(25))[12]]))
 """
 
 
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc is told")
 def test_freed_memory_is_used_again():
     """Median of 25 calls of two arrays of 16 MiB. Measured: 8 467 pages, or at most 2."""
 
@@ -36,5 +33,5 @@ def test_freed_memory_is_used_again():
         return json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
 
     kept, asked = median_faults("keep")
-    assert kept
-    assert asked < 0.1 * median_faults("leave")[1]
+    assert kept == (platform.libc_ver()[0] == "glibc")
+    assert asked < 0.1 * median_faults("leave")[1] or not kept
