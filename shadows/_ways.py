@@ -163,7 +163,43 @@ def line_planes(
     )
 
 
-def line_crossing(here: tuple[FacePlane, FacePlane], there: tuple[FacePlane, FacePlane]) -> Length:
-    """Return how far along the way the surfaces of ``line_planes`` pass through each other."""
+class Line(NamedTuple):
+    """Where surfaces pass through each other, and how the gap between them changes there.
+
+    Attributes:
+        along: How far along the way that is.
+        per_along: Change of the gap from a texel to the next along the way.
+        per_across: The same across it.
+    """
+
+    along: Length
+    per_along: Length
+    per_across: Length
+
+
+def line_crossing(here: tuple[FacePlane, FacePlane], there: tuple[FacePlane, FacePlane]) -> Line:
+    """Return where, along the way, the surfaces of ``line_planes`` pass through each other.
+
+    One of them may bend on the way, from the face at its start to the face at its end: of the
+    planes at both ends, those are meant that hold where they meet.
+    """
     gap, gap_there = (behind.at(0.0) - seen.at(0.0) for seen, behind in (here, there))
-    return safe_divide(gap, gap + gap_there)
+    inwards, inwards_there = (behind.per_along - seen.per_along for seen, behind in (here, there))
+    across, across_there = (behind.per_across - seen.per_across for seen, behind in (here, there))
+    along = safe_divide(gap, -inwards)
+    along_there = 1 - safe_divide(gap_there, -inwards_there)
+    ahead = (inwards < 0) & (along <= 1)
+    ahead_there = (inwards_there < 0) & (along_there >= 0)
+    # The gap is the larger of both planes' where that at the end starts below, else the smaller.
+    larger = gap + gap_there + inwards_there > 0
+    later = jnp.where(larger, along_there > along, along_there < along)
+    neither, last = ~ahead & ~ahead_there, ahead_there & (~ahead | later)
+    either = lambda first, second, between: jnp.where(
+        neither, between, jnp.where(last, second, first)
+    )
+    whole = gap + gap_there
+    return Line(
+        either(along, along_there, safe_divide(gap, whole)),
+        either(inwards, inwards_there, -whole),
+        either(across, -across_there, there[0].per_across - here[0].per_across),
+    )

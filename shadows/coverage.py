@@ -141,12 +141,9 @@ def coverage(
         return _with_rate(along, length), steep, _between(steep, at_ends, near)
 
     def of_lines(crossings: Crossings, ways: Ways) -> tuple[Length, Length, Length]:
-        here, there = line_planes(screen, ways, crossings.by, ids)
-        # Seen from there, along is the other way round, across is not.
-        weight = _squared_cosine(
-            there[0].per_along + here[0].per_along, there[0].per_across - here[0].per_across
-        )
-        return line_crossing(here, there), weight, weight
+        line = line_crossing(*line_planes(screen, ways, crossings.by, ids))
+        weight = _squared_cosine(line.per_along, line.per_across)
+        return line.along, weight, weight
 
     few = 4 * (height + width), height + width
     rests = _rests((of_edges, of_lines), (at_edges, at_lines), (height, width), few, screen.w.dtype)

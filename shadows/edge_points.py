@@ -99,7 +99,7 @@ def edge_changes(
         edge = jnp.where(lines, 0, here.by[0])
         vertices = get(ends_of_edges[0], edge), get(ends_of_edges[1], edge)
         a, b = (place(screen, ways, vertex) for vertex in vertices)
-        line = line_crossing(*line_planes(screen, ways, there.by, ids))
+        line = line_crossing(*line_planes(screen, ways, there.by, ids)).along
         along = jnp.clip(jnp.where(lines, line, edge_crossing(a, b)), 0, 1)
         rest = jnp.where(jnp.arange(size) < count, cut_texel(ways, along, height)[1], 4 * ids.size)
         step = jnp.where(side % 2 == 0, along, -along)

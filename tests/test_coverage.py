@@ -211,6 +211,39 @@ def test_lines_where_planes_pass_through_each_other(offset):
     assert float(change) == pytest.approx(1.6, rel=0.01)
 
 
+def ball_through_plane(height):
+    """A ball of faces about a texel wide, and a plane of that height which it passes through."""
+    ball = icosphere(0.8, subdivisions=3, dtype=np.float64)
+    corners = 0.9 * jnp.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    quad = jnp.append(corners, height + jnp.zeros((4, 1)), axis=1)
+    points = jnp.concatenate([jnp.asarray(ball.positions), quad]) * jnp.array([1, 1, 0.3])
+    faces = np.concatenate([ball.faces, len(ball.positions) + QUAD_FACES]).astype(np.int32)
+    return jnp.append(points, jnp.ones((len(points), 1)), axis=1), faces
+
+
+def test_lines_where_a_surface_bends_on_its_way_through():
+    """The area of a ball before a plane changes as it should, with an edge on most ways."""
+    first, faces = ball_through_plane(0.0)
+    edges = mesh_edges(np.asarray(first)[:, :3], faces)
+
+    @jax.jit
+    @jax.value_and_grad
+    def area(height):
+        clip, _ = ball_through_plane(height)
+        raster, found, _ = cover(clip, faces, edges, 32)
+        before = (raster.face_ids >= 0) & (raster.face_ids < len(faces) - 2)
+        return 4 * jnp.mean(blend_layers(found, before.astype(clip.dtype)))
+
+    low, high = -0.6, -0.4
+    steps = low + (np.arange(16) + 0.5) / 16 * (high - low)
+    change = np.mean([area(height)[1] for height in steps])
+    expected = float(area(high)[0] - area(low)[0]) / (high - low)
+    assert expected == pytest.approx(np.pi, rel=0.02)
+    assert change == pytest.approx(
+        expected, rel=0.015
+    )  # measured 0.8 % off; 4.6 by both ends' slopes
+
+
 def soup(seed, count=40, spread=1.0):
     rng = np.random.default_rng(seed)
     clip = rng.normal(size=(3 * count, 4)) * [spread, spread, 0.5, 0.3] + [0, 0, 0, 1]
