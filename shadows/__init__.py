@@ -85,6 +85,7 @@ from .surface import Surface as Surface
 from .surface import mesh_creases as mesh_creases
 from .surface import render_surface as render_surface
 from .surface import surface_coverage as surface_coverage
+from .surface_planes import SurfacePlanes as SurfacePlanes
 from .transforms import Camera as Camera
 from .transforms import OrthographicCamera as OrthographicCamera
 from .transforms import PerspectiveCamera as PerspectiveCamera
@@ -93,6 +94,7 @@ from .transforms import orthographic as orthographic
 from .transforms import perspective as perspective
 from .transforms import texel_from_clip as texel_from_clip
 from .transforms import transform_points as transform_points
+from .two_plane_bias import TwoPlaneBias as TwoPlaneBias
 from .variance_filter import VSMFilter as VSMFilter
 from .variance_filter import chebyshev_bound as chebyshev_bound
 from .visibility import check_techniques as check_techniques

@@ -9,7 +9,7 @@ same number serves a narrow and a wide one. None is in units of the depth buffer
 
 A new bias is a new subclass of ``Bias``: its fields are leaves that a fit can move, with
 their unit in ``field(metadata={"unit": ...})``. Biases that follow the receiver's plane are
-in ``plane_bias``, those that choose which surfaces cast in ``layer_bias``.
+in ``plane_bias`` and ``two_plane_bias``, those that choose which surfaces cast in ``layer_bias``.
 """
 
 import abc

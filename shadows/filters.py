@@ -24,9 +24,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, PyTree
 
+from tangentspace._math import safe_divide
+
 from .compare import Compare
 from .lights import Light
 from .shadow_map import Receiver, ShadowMap
+from .surface_planes import SurfacePlanes
 from .transforms import Scalar
 
 
@@ -70,20 +73,54 @@ class Filter(eqx.Module):
         """Return the visibility in [0, 1] of receivers after their bias (1 = lit)."""
 
 
+class TapPlane(NamedTuple):
+    """The plane of what a texel sees, as in ``SurfacePlanes``.
+
+    Attributes:
+        depth_per_column: Change of the depth from one column to the next.
+        depth_per_row: From one row to the next.
+        farthest: Depth beyond which the surface does not go on.
+    """
+
+    depth_per_column: Float[Array, "*points"]
+    depth_per_row: Float[Array, "*points"]
+    farthest: Float[Array, "*points"]
+
+
 class Tap(NamedTuple):
     """One texel asked, or a layer of it; it stays the same while only depth biases move.
 
     Attributes:
         stored: Depth of the texel; 1 outside the map.
         weight: Its weight, relative to those of the receiver's other taps.
-        across: Columns from the receiver to the texel's centre.
-        down: Rows from the receiver to the texel's centre.
+        across: Columns from the receiver to the place where that depth was seen.
+        down: Rows from the receiver to there.
+        plane: What the surface is round that place; None of a map without planes.
     """
 
     stored: Float[Array, "*points"]
     weight: Float[Array, "*points"]
     across: Float[Array, "*points"]
     down: Float[Array, "*points"]
+    plane: TapPlane | None = None
+
+    def lit(self, receiver: Receiver, compare: Compare) -> Float[Array, "*points"]:
+        """Return the visibility of a receiver by this texel.
+
+        The receiver's plane is compared with the depth where that was seen; if the map has
+        planes, the texel's too, with the receiver. Where the surface ends on the way, it is
+        taken to go on in the receiver's plane, or flat, whichever lights more.
+        """
+        visible = compare(self.stored, receiver.at_texel(self.across, self.down))
+        if self.plane is None:
+            return visible
+        column, row, farthest = self.plane
+        deeper = -self.across * column - self.down * row
+        part = jnp.maximum(farthest - self.stored, 0)
+        part = jnp.where(deeper > part, safe_divide(part, deeper), 1)
+        there = receiver.at_texel((1 - part) * self.across, (1 - part) * self.down).depth
+        nearer = receiver._replace(depth=jnp.minimum(there, receiver.depth))
+        return jnp.maximum(visible, compare(self.stored + part * deeper, nearer))
 
 
 class TapFilter(Filter):
@@ -139,14 +176,25 @@ def read_texel(
         The texel; of a map with shares, its two layers with their parts of the weight.
     """
     across, down = column + 0.5 - receiver.column, row + 0.5 - receiver.row
-    stored = fetch(shadow_map.depth, column, row, receiver)
-    if shadow_map.neighbor is None:
-        return (Tap(stored, weight, across, down),)
-    share = fetch(shadow_map.neighbor.share, column, row, receiver)
-    other = fetch(shadow_map.neighbor.depth, column, row, receiver)
+    read = lambda image, outside=1.0: fetch(image, column, row, receiver, outside=outside)
+
+    def tap(depth: Array, planes: SurfacePlanes | None, weight: Array) -> Tap:
+        if planes is None:
+            return Tap(read(depth), weight, across, down)
+        u, v = across, down
+        if planes.across is not None and planes.down is not None:
+            u, v = u + read(planes.across, 0.0), v + read(planes.down, 0.0)
+        slope = read(planes.depth_per_column, 0.0), read(planes.depth_per_row, 0.0)
+        plane = TapPlane(*slope, read(planes.farthest))
+        return Tap(read(planes.depth), weight, u, v, plane)
+
+    planes, neighbor = (None if receiver.plane is None else shadow_map.planes), shadow_map.neighbor
+    if neighbor is None:
+        return (tap(shadow_map.depth, planes, weight),)
+    share = read(neighbor.share)
     return (
-        Tap(stored, weight * share, across, down),
-        Tap(other, weight * (1 - share), across, down),
+        tap(shadow_map.depth, planes, weight * share),
+        tap(neighbor.depth, None if planes is None else neighbor.planes, weight * (1 - share)),
     )
 
 
@@ -171,9 +219,7 @@ def _compare(
 ) -> Float[Array, "..."]:
     receiver = receiver._replace(depth_bias=depth_bias)
     total = functools.reduce(operator.add, (tap.weight for tap in taps))
-    weighted = (
-        tap.weight * compare(tap.stored, receiver.at_texel(tap.across, tap.down)) for tap in taps
-    )
+    weighted = (tap.weight * tap.lit(receiver, compare) for tap in taps)
     # The division is also where XLA stops fusing; without one it computes the comparison
     # again for each color channel.
     visibility = functools.reduce(operator.add, weighted) / total
@@ -193,7 +239,7 @@ def _compare_with_slope(
     def both(tap: Tap) -> Array:
         def lit(depth_bias: Array) -> Array:
             moved = receiver._replace(depth_bias=depth_bias)
-            return tap.weight * compare(tap.stored, moved.at_texel(tap.across, tap.down))
+            return tap.weight * tap.lit(moved, compare)
 
         return lax.complex(*jax.jvp(lit, (depth_bias,), (jnp.ones_like(depth_bias),)))
 

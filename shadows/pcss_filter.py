@@ -91,9 +91,8 @@ class PCSSFilter(Filter):
         soft = SoftCompare(self.blocker_softness)
         found, length = 0.0, 0.0
         for tap in taps:
-            at_texel = receiver.at_texel(tap.across, tap.down)
             # Nothing for the receiver's own surface, which would pull the mean towards it.
-            blocked = jnp.maximum(1 - 2 * soft(tap.stored, at_texel), 0) ** 2
+            blocked = jnp.maximum(1 - 2 * tap.lit(receiver, soft), 0) ** 2
             weight = tap.weight * blocked
             # How far the blocker is from the receiver, not from its plane at that texel.
             drop = receiver.depth - receiver.depth_bias - tap.stored

@@ -8,7 +8,7 @@ A light that one image cannot serve has several (the faces of a cube, cascades):
 along a leading axis, and each point is looked up in the first that holds it.
 """
 
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,7 @@ from .coverage import coverage, neighbor_depth
 from .rasterize import Raster, rasterize, rasterize_two
 from .silhouettes import MeshEdges
 from .steady_frame import main_plane, steady_frame
+from .surface_planes import SurfacePlanes, neighbor_planes, seen_planes
 from .transforms import Scalar, texel_from_clip, transform_points
 
 _STEEPEST = 100.0  # tangent of the angle to the light up to which slopes are followed
@@ -30,7 +31,7 @@ _STEEPEST = 100.0  # tangent of the angle to the light up to which slopes are fo
 Coordinates = list[Array]
 
 
-Casters = Literal["nearest", "back", "two"]
+Casters = Literal["nearest", "back", "two", "planes"]
 
 
 class NeighborLayer(NamedTuple):
@@ -40,11 +41,13 @@ class NeighborLayer(NamedTuple):
         share: Of the texel, covered by its own surface.
         depth: Window depth of the neighbour's surface, in its plane at the texel's centre.
         second: Of the neighbour's second surface, where casters of two layers were asked for.
+        planes: Of the neighbour's surface, where planes were asked for.
     """
 
     share: Float[Array, "*maps map_height map_width"]
     depth: Float[Array, "*maps map_height map_width"]
     second: Float[Array, "*maps map_height map_width"] | None = None
+    planes: SurfacePlanes | None = None
 
 
 class ShadowMap(NamedTuple):
@@ -55,12 +58,15 @@ class ShadowMap(NamedTuple):
         clip_from_world: The matrix that it was made with; one for each image.
         second: Depth of the second surface, where casters of two layers were asked for.
         neighbor: What covers the rest of each texel; None where edges have no derivatives.
+        planes: Of the nearest surface, where they were asked for: a comparison that follows
+            the receiver's plane follows these too.
     """
 
     depth: Float[Array, "*maps map_height map_width"]
     clip_from_world: Float[Array, "*maps 4 4"]
     second: Float[Array, "*maps map_height map_width"] | None = None
     neighbor: NeighborLayer | None = None
+    planes: SurfacePlanes | None = None
 
     @property
     def texel_from_world(self) -> Float[Array, "*maps 4 4"]:
@@ -89,7 +95,8 @@ def render_shadow_map(
         map_size: Texels on each side.
         casters: ``nearest`` surface; only ``back`` faces, turned away from the light, so
             that lit faces cannot shade themselves (wants closed meshes, and leaks where
-            surfaces meet); or ``two``, the nearest surface and the one behind it.
+            surfaces meet); ``two``, the nearest surface and the one behind it; or the nearest
+            surface and the ``planes`` of its faces.
         edges: ``mesh_edges(positions, faces)``, to know which share of each texel its surface
             covers, so that shadow edges have derivatives; None for not to compute that.
 
@@ -103,9 +110,9 @@ def render_shadow_map(
     References:
         L. Williams, "Casting Curved Shadows on Curved Surfaces", SIGGRAPH 1978.
     """
-    if casters not in ("nearest", "back", "two"):
+    if casters not in get_args(Casters):
         raise ValueError(
-            f"render_shadow_map: expected `casters` nearest, back or two, got {casters!r}"
+            f"render_shadow_map: expected `casters` nearest, back, two or planes, got {casters!r}"
         )
     positions, size = jnp.asarray(positions), (map_size, map_size)
     steady = None if edges is None else main_plane(positions, faces)
@@ -121,11 +128,14 @@ def render_shadow_map(
             rasters = (rasterize(clip, faces, image_size=size, cull_front=casters == "back"),)
         depth, *others = (raster.depth for raster in rasters)
         second = others[0] if others else None
+        planes = seen_planes(clip, faces, rasters[0]) if casters == "planes" else None
         if edges is None:
-            return ShadowMap(depth, matrix, second)
+            return ShadowMap(depth, matrix, second, planes=planes)
         covers = coverage(clip, faces, edges, rasters[0].face_ids)
         depths = (neighbor_depth(clip, faces, covers, raster) for raster in rasters)
-        return ShadowMap(depth, matrix, second, NeighborLayer(covers.share, *depths))
+        beside = None if planes is None else neighbor_planes(planes, covers)
+        neighbor = NeighborLayer(covers.share, *depths, planes=beside)
+        return ShadowMap(depth, matrix, second, neighbor, planes)
 
     matrix = jnp.asarray(clip_from_world)
     if matrix.ndim == 2:

@@ -295,5 +295,7 @@ def test_only_one_bias_may_choose_the_casters():
 @pytest.mark.errors
 def test_other_casters_are_refused():
     arrays = np.zeros((3, 3)), np.zeros((1, 3), int), jnp.eye(4)
-    with pytest.raises(ValueError, match="expected `casters` nearest, back or two, got 'front'"):
+    with pytest.raises(
+        ValueError, match="expected `casters` nearest, back, two or planes, got 'front'"
+    ):
         render_shadow_map(*arrays, map_size=8, casters="front")

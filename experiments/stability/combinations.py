@@ -25,6 +25,7 @@ from shadows.pcss_filter import PCSSFilter
 from shadows.plane_bias import AdaptiveBias, ReceiverPlaneBias
 from shadows.shadow_map import Receiver
 from shadows.transforms import Scalar
+from shadows.two_plane_bias import TwoPlaneBias
 from shadows.variance_filter import VSMFilter
 from shadows.visibility import default_bias
 from shadows.window_filters import BilinearFilter, PCFFilter, TentFilter
@@ -89,6 +90,7 @@ BIASES: dict[str, Bias] = {
     "normal-offset": NormalOffsetBias(),
     "receiver-plane": ReceiverPlaneBias(),
     "adaptive": AdaptiveBias(),
+    "two-plane": TwoPlaneBias(),
     "front-face-culling": FrontFaceCullingBias(),
     "midpoint": MidpointBias(),
     "second-depth": SecondDepthBias(),

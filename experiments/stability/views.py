@@ -89,7 +89,7 @@ def geometry_stages(image: tuple[int, int], map_size: int) -> GeometryStages:
     def maps(positions, faces, matrix):
         return tuple(
             render_shadow_map(positions, faces, matrix, map_size=map_size, casters=casters)
-            for casters in ("two", "back")
+            for casters in ("two", "back", "planes")
         )
 
     return GeometryStages(surface, matrices, maps)
@@ -116,17 +116,19 @@ def receiver_stage(
 
 
 class Seen(NamedTuple):
-    """What every technique starts from; the maps hold two layers, and back faces only."""
+    """What every technique starts from; the maps hold two layers, back faces only, and planes."""
 
     receiver: Receiver
     two: ShadowMap
     back: ShadowMap
+    planes: ShadowMap
 
 
 @stage
 def bias_stage(bias: Bias, seen: Seen, reach: Array) -> tuple[Receiver, ShadowMap]:
     """Return the receiver and the map after a bias."""
-    maps = {"two": seen.two, "back": seen.back, "nearest": seen.two._replace(second=None)}
+    nearest = seen.two._replace(second=None)
+    maps = {"two": seen.two, "back": seen.back, "planes": seen.planes, "nearest": nearest}
     chosen = bias.prepare(maps[bias.casters])
     strong = lambda x: jnp.asarray(x, reach.dtype) if isinstance(x, float) else x
     return jax.tree.map(strong, bias(seen.receiver, reach)), chosen._replace(second=None)
@@ -207,12 +209,13 @@ class View:
     def drawn_from(self, clip: Array) -> "View":
         """Return the same view with maps of vertices given in clip space, w = 1 for all."""
         straight = jnp.eye(4, dtype=clip.dtype)
-        two, back = self._stages.maps[0](clip, self.mesh.faces, straight)
+        two, back, planes = self._stages.maps[0](clip, self.mesh.faces, straight)
         seen = self.seen
         return self.with_seen(
             seen._replace(
                 two=seen.two._replace(depth=two.depth, second=two.second),
                 back=seen.back._replace(depth=back.depth),
+                planes=seen.planes._replace(depth=planes.depth, planes=planes.planes),
             )
         )
 
@@ -234,7 +237,7 @@ class View:
         by_light, further = to_light_stage[1]((self.light, self.surface.position), to_light)
         surface = jax.tree.map(jnp.zeros_like, eqx.filter(self.surface, eqx.is_inexact_array))
         surface = surface._replace(position=position + further, face_normal=normal)
-        maps = [(slopes.two, slopes.back)]
+        maps = [(slopes.two, slopes.back, slopes.planes)]
         if len(self._matrices) > 1:
             maps = [jax.tree.map(lambda x, k=k: x[k], maps[0]) for k in range(MAPS)]
         by_maps = [
