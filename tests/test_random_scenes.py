@@ -18,7 +18,7 @@ from experiments.edge_gradients.random_scenes import (
 from experiments.edge_gradients.supersampled import supersampled
 
 SCENES = 60
-SMALL = Settings(image_size=64, map_size=512, times=(0.015, 0.016, 0.017, 0.018))
+SMALL = Settings(image_size=64, map_size=512, times=(0.015, 0.016, 0.017, 0.018), moments=8)
 SEEDS = (0, 1, 2, 3, 4, 5, 6, 7)
 
 
