@@ -148,6 +148,16 @@ def test_contacts_keep_their_shadow(name, most):
     assert lit_share(AnalyticBias()) > 3 * both  # measured 0.15 and 0.45
 
 
+@pytest.mark.parametrize("name", FILTERS)
+def test_steep_faces_count_no_deeper_than_they_reach(name):
+    """Close below a fold of which one side is steep, all is dark; its plane would lead below."""
+    points, *where = fold(0.0, 40.0, 0.4, 0.3)
+    shadow_map = draw(points, ROOF, ABOVE, map_size=SIZE, casters="planes")
+    positions, _ = on_fold(0.0, 0.0, *where, 0)
+    below, up = positions - [0, 0, 0.1], np.broadcast_to([0.0, 0.0, 1.0], positions.shape)
+    assert float(jnp.max(lit(shadow_map, below, up, TwoPlaneBias(0.0), FILTERS[name]))) == 0
+
+
 # What the map keeps
 
 
