@@ -190,14 +190,14 @@ def line_crossing(here: tuple[FacePlane, FacePlane], there: tuple[FacePlane, Fac
     along_there = 1 - safe_divide(gap_there, -inwards_there)
     ahead = (inwards < 0) & (along <= 1)
     ahead_there = (inwards_there < 0) & (along_there >= 0)
+    whole = gap + gap_there
     # The gap is the larger of both planes' where that at the end starts below, else the smaller.
-    larger = gap + gap_there + inwards_there > 0
+    larger = whole + inwards_there > 0
     later = jnp.where(larger, along_there > along, along_there < along)
     neither, last = ~ahead & ~ahead_there, ahead_there & (~ahead | later)
     either = lambda first, second, between: jnp.where(
         neither, between, jnp.where(last, second, first)
     )
-    whole = gap + gap_there
     return Line(
         either(along, along_there, safe_divide(gap, whole)),
         either(inwards, inwards_there, -whole),
